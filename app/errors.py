@@ -1,0 +1,104 @@
+"""The one error tree. It knows no HTTP; ``app.api.problems`` maps a class to a status.
+
+Every error says in ``detail`` what went wrong and what the user can do about it; ``problems`` name the places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing that is wrong or doubtful, and where: file name, line (from 1), key or element path."""
+
+    problem: str
+    file: str | None = None
+    line: int | None = None
+    where: str | None = None
+
+    def as_dict(self) -> dict[str, str | int]:
+        """The problem without its empty members, in the contract's words."""
+        members = {"file": self.file, "line": self.line, "where": self.where, "problem": self.problem}
+        return {name: value for name, value in members.items() if value is not None}
+
+
+class FleetMapError(Exception):
+    """Base of all errors that a user can be told about."""
+
+    def __init__(self, detail: str, problems: Sequence[Problem] = ()) -> None:
+        super().__init__(detail)
+        self.detail = detail
+        self.problems = tuple(problems)
+
+    def __reduce__(self) -> tuple[type[FleetMapError], tuple[str, tuple[Problem, ...]]]:
+        return type(self), (self.detail, self.problems)
+
+
+class NotFound(FleetMapError):
+    """No such environment, version, map, grid, source, job or token."""
+
+
+class Gone(NotFound):
+    """It was here and has been deleted."""
+
+
+class Invalid(FleetMapError):
+    """A parameter, name or request body that cannot be used."""
+
+
+class BadUpload(FleetMapError):
+    """An upload that cannot be taken in."""
+
+
+class UnreadableFile(BadUpload):
+    """A file that is not what its format says."""
+
+
+class TooLarge(BadUpload):
+    """An upload, or what it would unfold to, beyond a limit (limits are settings)."""
+
+
+class UnsafeArchive(BadUpload):
+    """An archive with links, escaping names, overlaps or encrypted members."""
+
+
+class CannotConvert(FleetMapError):
+    """The stored layers do not give the wanted map; ``detail`` says what to supply."""
+
+
+class MissingLayer(CannotConvert):
+    """A layer that the format needs neither exists nor can be derived."""
+
+
+class MissingDatum(CannotConvert):
+    """The format speaks of places on earth and the environment has no datum."""
+
+
+class Ambiguous(CannotConvert):
+    """Several parts fit and none was named."""
+
+
+class Conflict(FleetMapError):
+    """The request does not fit the present state (a taken name, a reused idempotency key)."""
+
+
+class StaleParent(Conflict):
+    """The head has moved since the version that the request was based on."""
+
+
+class Denied(FleetMapError):
+    """A token without the role or the scope that the call needs."""
+
+
+class Unauthenticated(Denied):
+    """No token, or an unknown or expired one."""
+
+
+class Unavailable(FleetMapError):
+    """Not now: too much work, a store that does not answer. Trying again later may help."""
+
+
+class Damaged(FleetMapError):
+    """Stored bytes that no longer match their hash. An alarm, never served."""

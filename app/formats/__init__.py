@@ -1,0 +1,326 @@
+"""The registry of formats, the read boundary and its limits.
+
+A format is one module of this package that ends in ``register(Format(...))``; nothing else is edited. Modules whose
+name starts with ``_`` are tools that readers share. A map is a bundle of named bytes in and out: no paths, no network.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import yaml
+from lxml import etree
+
+from app import parameters
+from app.errors import BadUpload, FleetMapError, Invalid, NotFound, Problem, TooLarge, UnreadableFile
+from app.model.features import Features
+from app.model.frame import GROUND, Anchor
+from app.model.geodesy import LocalFrame
+from app.model.layers import Layer, Layers
+
+Files = Mapping[str, bytes]
+"""A map as named files: relative path with forward slashes -> content."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What an upload may hold. Every number is a setting; the defaults let real maps pass."""
+
+    upload_bytes: int = 512 * 2**20
+    unpacked_bytes: int = 1024 * 2**20
+    files: int = 10_000
+    pixels: int = 2**28
+    features: int = 5_000_000
+    yaml_depth: int = 48
+    yaml_nodes: int = 20_000_000
+    xml_attribute_bytes: int = 64 * 2**10
+    text_bytes: int = 256 * 2**20
+    seconds: float = 300.0
+    memory_bytes: int = 8 * 2**30
+    warnings: int = 1000
+
+
+@dataclass(slots=True)
+class ReadContext:
+    """What a reader is told, and where it leaves its warnings.
+
+    frame: the environment's, where it has a datum. level: where the map belongs. grid: the name for a grid, else None.
+    layer: what the lines and polygons of a drawing are meant for, else None. options: the format's own read options.
+    wanted: the layers that will be used (None: all); a reader may leave others out. main: the file that was detected.
+    """
+
+    limits: Limits = field(default_factory=Limits)
+    frame: LocalFrame | None = None
+    level: str = GROUND
+    grid: str | None = None
+    layer: Layer | None = None
+    options: Any = None
+    wanted: frozenset[Layer] | None = None
+    main: str = ""
+    warnings: list[Problem] = field(default_factory=list)
+
+    def warn(self, problem: str, *, file: str | None = None, line: int | None = None, where: str | None = None) -> None:
+        """Something doubtful that is stored all the same."""
+        if len(self.warnings) < self.limits.warnings:
+            self.warnings.append(Problem(problem, file or self.main or None, line, where))
+
+    def wants(self, layer: Layer) -> bool:
+        """Whether anybody will use this layer."""
+        return self.wanted is None or layer in self.wanted
+
+
+@dataclass(slots=True)
+class WriteContext:
+    """What a writer is told, and where it declares what it lost or made up (loss is data).
+
+    title: the environment's name, for formats with a place for one. options: the format's own write options.
+    attribution: licences and credits of the sources, for formats with a place for them.
+    """
+
+    title: str = "map"
+    options: Any = None
+    attribution: tuple[str, ...] = ()
+    dropped: list[dict[str, Any]] = field(default_factory=list)
+    template: list[dict[str, Any]] = field(default_factory=list)
+    warnings: list[Problem] = field(default_factory=list)
+
+    def drop(self, what: str, count: int, why: str) -> None:
+        """This much of the stored information has no place in the format."""
+        if count:
+            self.dropped.append({"what": what, "count": count, "why": why})
+
+    def fill(self, what: str, value: Any, why: str) -> None:
+        """The format asks for this and no layer has it: a default was filled in."""
+        self.template.append({"what": what, "value": value, "why": why})
+
+    def warn(self, problem: str, *, file: str | None = None, where: str | None = None) -> None:
+        """The map was written, but its consumer may not like it."""
+        self.warnings.append(Problem(problem, file, None, where))
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """What a writer needs: one of these sets of layers, and a datum or not.
+
+    one_of: alternatives, the first that is complete is enough; every carried layer that is there is written.
+    anchor: the coordinates the format speaks, so that items anchored otherwise need a datum. datum: needed always.
+    """
+
+    one_of: tuple[frozenset[Layer], ...]
+    anchor: Anchor | None = None
+    datum: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class NoOptions:
+    """For formats without options of their own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A file format. Only what is declared here is known of it elsewhere.
+
+    name: the contract's id. files: the names it is served as. media_types: of the served files, in that order.
+    carries: layers it can hold. needs: what writing takes. detect: is this file (name, content) the main file of such
+    a map; sure formats first (``rank``). companions: further files of the upload that belong to a main file.
+    family: format family of its objects (``osm``, ``kml`` …). rank: of two files that tell the same network, the
+    higher one wins. version: raise it when the same layers give other bytes (it is part of every ETag).
+    """
+
+    name: str
+    title: str
+    files: tuple[str, ...]
+    media_types: tuple[str, ...]
+    carries: frozenset[Layer]
+    detect: Callable[[str, bytes], bool]
+    read: Callable[[Files, ReadContext], Layers] | None = None
+    write: Callable[[Layers, WriteContext], dict[str, bytes]] | None = None
+    needs: Needs = field(default_factory=lambda: Needs(()))
+    companions: Callable[[str, bytes, Sequence[str]], Iterable[str]] = lambda main, data, names: ()
+    read_options: type[Any] = NoOptions
+    write_options: type[Any] = NoOptions
+    family: str = ""
+    rank: int = 0
+    version: int = 1
+    extensions: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """The files of an upload that are one map: a main file and what belongs to it."""
+
+    format: Format
+    main: str
+    files: Files
+
+
+_registry: dict[str, Format] = {}
+
+
+def register(new: Format) -> Format:
+    """Make a format known. The last statement of its module."""
+    if new.name in _registry:
+        raise ValueError(f"format {new.name} is registered twice")
+    _registry[new.name] = new
+    return new
+
+
+@cache
+def _discover() -> None:
+    for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
+        if not module.startswith("_"):
+            importlib.import_module(f"{__name__}.{module}")
+
+
+def all_formats() -> dict[str, Format]:
+    """Every format by name, in alphabetical order."""
+    _discover()
+    return dict(sorted(_registry.items()))
+
+
+def get_format(name: str) -> Format:
+    """The format of this name; NotFound tells the known ones."""
+    known = all_formats()
+    if name not in known:
+        raise NotFound(f"there is no format {name!r}; known formats: {', '.join(known)}")
+    return known[name]
+
+
+def detect(name: str, data: bytes) -> Format | None:
+    """The format whose main file this is, judged by content; the highest rank wins."""
+    readable = sorted((f for f in all_formats().values() if f.read), key=lambda f: (-f.rank, f.name))
+    return next((f for f in readable if f.detect(name, data)), None)
+
+
+def group(files: Files, format_name: str | None = None) -> tuple[list[Group], list[str]]:
+    """Sort an upload into maps: the groups, and the names that belong to none.
+
+    With a format name every file that the format accepts as main file is one; where none looks like it, the only file
+    is taken at its word, so that the reader can say what is wrong with it.
+    """
+    groups, used = [], set()
+    asked = get_format(format_name) if format_name else None
+    for name in sorted(files):
+        known = asked if asked and asked.detect(name, files[name]) else None
+        known = known or (None if asked else detect(name, files[name]))
+        if known:
+            groups.append((known, name))
+    if asked and not groups:
+        if asked.read is None:
+            raise Invalid(f"{asked.name} can be served but not read")
+        main = next((n for n in sorted(files) if n.lower().endswith(asked.extensions)), None)
+        groups = [(asked, main or next(iter(sorted(files))))]
+    out = []
+    mains = {main for _, main in groups}
+    for known, main in groups:
+        others = [n for n in known.companions(main, files[main], sorted(files)) if n in files and n not in mains]
+        used.update([main, *others])
+        out.append(Group(known, main, {n: files[n] for n in [main, *others]}))
+    return out, sorted(set(files) - used)
+
+
+BAD_INPUT = (
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    ArithmeticError,
+    RecursionError,
+    UnicodeError,
+    EOFError,
+    OSError,
+    SyntaxError,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
+    NotImplementedError,
+    yaml.YAMLError,
+    etree.LxmlError,
+)
+"""What readers raise on input they cannot use; anything else is a bug of ours and stays one."""
+
+
+def read(item: Group, context: ReadContext) -> Layers:
+    """One map's files -> layers. The read boundary: whatever is wrong with the bytes becomes a BadUpload.
+
+    Raises UnreadableFile (with file, line and reason), TooLarge or UnsafeArchive.
+    """
+    known = item.format
+    if known.read is None:
+        raise Invalid(f"{known.name} can be served but not read")
+    context.main = item.main
+    if context.options is None:
+        context.options = known.read_options()
+    try:
+        layers = known.read(item.files, context)
+    except BadUpload as error:
+        raise type(error)(
+            error.detail, [_in_file(p, item.main) for p in error.problems] or [_said(error, item)]
+        ) from error
+    except FleetMapError as error:
+        raise UnreadableFile(
+            f"{item.main}: {error.detail}", [_in_file(p, item.main) for p in error.problems] or [_said(error, item)]
+        ) from error
+    except MemoryError as error:
+        raise TooLarge(
+            f"{item.main} needs more memory than an upload may use", [Problem("out of memory", item.main)]
+        ) from error
+    except BAD_INPUT as error:
+        line, reason = _explain(error)
+        detail = f"{item.main} cannot be read as {known.title}: {reason}"
+        raise UnreadableFile(detail, [Problem(reason, item.main, line)]) from error
+    count = sum(len(p) for p in layers.parts.values() if isinstance(p, Features))
+    if count > context.limits.features:
+        raise TooLarge(f"{item.main} has {count} features; the limit is {context.limits.features}")
+    return layers
+
+
+def write(known: Format, layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """Layers -> one map's files, main file first."""
+    if known.write is None:
+        raise Invalid(f"{known.name} can be read but not served")
+    if context.options is None:
+        context.options = known.write_options()
+    return known.write(layers, context)
+
+
+def write_options(known: Format, values: Mapping[str, str]) -> Any:
+    """The format's write options from texts; Invalid says which are accepted."""
+    return parameters.parse(known.write_options, values, f"parameter of {known.name}")
+
+
+def read_options(known: Format, values: Mapping[str, str]) -> Any:
+    """The format's read options from texts; Invalid says which are accepted."""
+    return parameters.parse(known.read_options, values, f"option of {known.name}")
+
+
+def _in_file(problem: Problem, file: str) -> Problem:
+    return problem if problem.file else Problem(problem.problem, file, problem.line, problem.where)
+
+
+def _said(error: FleetMapError, item: Group) -> Problem:
+    return Problem(error.detail, item.main)
+
+
+def _explain(error: BaseException) -> tuple[int | None, str]:
+    """Line (from 1, where the parser told one) and a reason that a user understands."""
+    if isinstance(error, yaml.MarkedYAMLError):
+        mark = error.problem_mark or error.context_mark
+        return (mark.line + 1 if mark else None), " ".join(filter(None, [error.context, error.problem])) or "not YAML"
+    if isinstance(error, SyntaxError):  # lxml's XMLSyntaxError is one, and Pillow raises it for broken PNG chunks
+        return error.lineno, error.msg or "syntax error"
+    if isinstance(error, RecursionError):
+        return None, "nested too deeply"
+    if isinstance(error, KeyError):
+        return None, f"{error.args[0]!r} is missing" if error.args else "a key is missing"
+    if isinstance(error, UnicodeError):
+        return None, f"not UTF-8 text ({error})"
+    return None, str(error) or type(error).__name__

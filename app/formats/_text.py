@@ -1,0 +1,23 @@
+"""Numbers as text, the same on every machine (contract: rounded to 1e-9 m or 1e-12 degrees before printing)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+METRES = 9
+DEGREES = 12
+"""Decimals to round to: a nanometre, and a tenth of a micrometre on the ground."""
+
+
+def number(value: float, decimals: int = METRES) -> str:
+    """The shortest text that reads back as the rounded value; always with a point or an exponent, never ``-0.0``."""
+    return repr(round(float(value), decimals) + 0.0)
+
+
+def numbers(values: NDArray[np.float64] | Iterable[float], decimals: int = METRES) -> list[str]:
+    """The same for many values at once."""
+    rounded = np.round(np.asarray(values, np.float64), decimals) + 0.0
+    return list(map(repr, rounded.tolist()))

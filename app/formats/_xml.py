@@ -1,0 +1,50 @@
+"""Safe XML for readers: no DOCTYPE, no entities, no network, bounded depth and attributes (security, reading 5)."""
+
+from __future__ import annotations
+
+import re
+
+from lxml import etree
+
+from app.errors import Problem, UnreadableFile
+from app.formats import Limits
+
+_DOCTYPE = re.compile(rb"<!\s*(DOCTYPE|ENTITY)", re.IGNORECASE)
+
+
+def parse(data: bytes, limits: Limits, *, keep_comments: bool = False) -> etree._Element:
+    """The root element. Raises UnreadableFile with the line, or XMLSyntaxError, which the read boundary explains."""
+    check_prolog(data)
+    parser = etree.XMLParser(
+        resolve_entities=False,
+        no_network=True,
+        load_dtd=False,
+        dtd_validation=False,
+        huge_tree=False,
+        remove_comments=not keep_comments,
+        remove_pis=True,
+    )
+    root = etree.fromstring(data.lstrip(b"\xef\xbb\xbf \t\r\n"), parser)
+    if root.getroottree().docinfo.internalDTD is not None:
+        raise UnreadableFile("a DOCTYPE is not accepted: remove it", [Problem("DOCTYPE is not accepted", line=1)])
+    check_bounds(root, limits)
+    return root
+
+
+def check_prolog(data: bytes) -> None:
+    """Refuse a DOCTYPE or entity declaration before any parser sees it, whatever the encoding says."""
+    head = data[: 2**20]
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        head = head.decode("utf-16", "replace").encode()
+    found = _DOCTYPE.search(head)
+    if found:
+        line = head.count(b"\n", 0, found.start()) + 1
+        reason = "DOCTYPE and entity declarations are not accepted: remove them"
+        raise UnreadableFile(reason, [Problem(reason, line=line)])
+
+
+def check_bounds(root: etree._Element, limits: Limits) -> None:
+    """Refuse attributes longer than a real map's; libxml2 itself stops at depth 256 and texts of 10 MB."""
+    for long in root.xpath("//@*[string-length() > $most]", most=limits.xml_attribute_bytes):
+        reason = f"an attribute is longer than {limits.xml_attribute_bytes} characters"
+        raise UnreadableFile(reason, [Problem(reason, line=long.getparent().sourceline, where=long.attrname)])

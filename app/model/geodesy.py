@@ -1,0 +1,94 @@
+"""WGS 84 to the local frame and back: the only module that knows the ellipsoid.
+
+The local frame is the transverse Mercator projection centred on the datum with scale 1, turned by the datum's heading
+(contract, section 1). PROJ's ``tmerc`` (Poder/Engsager) is exact to nanometres at these distances.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from pyproj import Proj
+
+from app.model.frame import Datum
+
+Array = NDArray[np.float64]
+
+
+class LocalFrame:
+    """The local frame of a datum. Vectorised; every array is float64 of shape [n, 2] or [n, 3]."""
+
+    __slots__ = ("_cos", "_proj", "_sin", "datum")
+
+    def __init__(self, datum: Datum) -> None:
+        self.datum = datum
+        # Degrees with 17 significant digits: PROJ reads back the same float64.
+        self._proj = Proj(
+            f"+proj=tmerc +lat_0={datum.latitude:.17g} +lon_0={datum.longitude:.17g} +k=1 +x_0=0 +y_0=0 "
+            "+ellps=WGS84 +units=m +no_defs"
+        )
+        heading = math.radians(datum.heading)
+        self._cos, self._sin = math.cos(heading), math.sin(heading)
+
+    def to_local(self, lonlat: Array) -> Array:
+        """(longitude, latitude[, altitude]) in degrees and metres -> (x, y[, z]) in metres.
+
+        A third column passes through: heights are stored as given, relative to what their source says.
+        """
+        points = np.asarray(lonlat, np.float64)
+        out = points.copy()
+        east, north = self._proj(points[:, 0], points[:, 1])
+        if self._sin == 0.0 and self._cos == 1.0:
+            out[:, 0], out[:, 1] = east, north
+        else:
+            out[:, 0] = east * self._cos - north * self._sin
+            out[:, 1] = east * self._sin + north * self._cos
+        return out
+
+    def to_wgs84(self, xy: Array) -> Array:
+        """(x, y[, z]) in metres -> (longitude, latitude[, altitude]); longitude in [-180, 180]."""
+        points = np.asarray(xy, np.float64)
+        out = points.copy()
+        x, y = points[:, 0], points[:, 1]
+        if self._sin == 0.0 and self._cos == 1.0:
+            east, north = x, y
+        else:
+            east = x * self._cos + y * self._sin
+            north = y * self._cos - x * self._sin
+        longitude, latitude = self._proj(east, north, inverse=True)
+        out[:, 0], out[:, 1] = longitude, latitude
+        return out
+
+    def yaw_to_heading(self, yaw: float) -> float:
+        """A local yaw (radians, counter-clockwise from +x) as degrees clockwise from true north, in [0, 360)."""
+        return (90.0 - math.degrees(yaw) + self.datum.heading) % 360.0
+
+    def geometries_to_local(self, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
+        """Shapely geometries in degrees -> metres."""
+        return _transform(geometry, self.to_local)
+
+    def geometries_to_wgs84(self, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
+        """Shapely geometries in metres -> degrees."""
+        return _transform(geometry, self.to_wgs84)
+
+
+def _transform(geometry: NDArray[np.object_], function: object) -> NDArray[np.object_]:
+    """Apply to x and y of all coordinates at once; a z passes through (mixed 2-D and 3-D is fine)."""
+    if not len(geometry):
+        return geometry
+    has_z = shapely.has_z(geometry)
+    out = np.empty(len(geometry), object)
+    for mask, include_z in ((~has_z, False), (has_z, True)):
+        if mask.any():
+            out[mask] = shapely.transform(geometry[mask], function, include_z=include_z)
+    return out
+
+
+@lru_cache(maxsize=256)
+def local_frame(datum: Datum) -> LocalFrame:
+    """The frame of a datum; building one costs PROJ about a millisecond, so they are kept."""
+    return LocalFrame(datum)

@@ -1,0 +1,82 @@
+"""Occupancy: named 2-D grids in the local frame, as Nav2 reads them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import Invalid
+from app.model.frame import MAX_METRES
+
+Mode = Literal["trinary", "scale", "raw"]
+
+FREE = 0
+OCCUPIED = 100
+UNKNOWN = 255
+"""Cell values: 0…100 is Nav2's cell value, 255 its -1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OccupancyGrid:
+    """Cells and where they lie.
+
+    cells: uint8 [height, width], 0…100 or 255; row 0 is the *bottom* row (smallest y), as in nav_msgs/OccupancyGrid;
+    images have row 0 on top, so readers and writers flip. resolution: metres a cell. origin: (x, y, yaw) of the lower
+    left corner of cell (0, 0), metres and radians. mode and thresholds: how the source's image is to be read again.
+    properties: what else the source says, by format.
+    """
+
+    cells: NDArray[np.uint8]
+    resolution: float
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mode: Mode = "trinary"
+    occupied_thresh: float = 0.65
+    free_thresh: float = 0.196
+    negate: bool = False
+    properties: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.cells.dtype != np.uint8 or self.cells.ndim != 2 or 0 in self.cells.shape:
+            raise Invalid(f"a grid needs uint8 cells of at least 1 × 1, got {self.cells.dtype} {self.cells.shape}")
+        if not (math.isfinite(self.resolution) and 1e-6 <= self.resolution <= 1e4):
+            raise Invalid(f"a grid's resolution must be between 1e-6 and 1e4 metres a cell, got {self.resolution!r}")
+        if len(self.origin) != 3 or not all(math.isfinite(v) and abs(v) <= MAX_METRES for v in self.origin):
+            raise Invalid(f"a grid's origin must be three finite numbers [x, y, yaw], got {list(self.origin)!r}")
+        for name in ("occupied_thresh", "free_thresh"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and 0.0 <= value <= 1.0):
+                raise Invalid(f"{name} must be between 0 and 1, got {value!r}")
+        if self.mode not in ("trinary", "scale", "raw"):
+            raise Invalid(f"mode must be trinary, scale or raw, got {self.mode!r}")
+        if bool(((self.cells > OCCUPIED) & (self.cells != UNKNOWN)).any()):
+            raise Invalid("cells must be 0 to 100, or 255 for unknown")
+        self.cells.flags.writeable = False
+
+    @property
+    def width(self) -> int:
+        """Cells along x."""
+        return int(self.cells.shape[1])
+
+    @property
+    def height(self) -> int:
+        """Cells along y."""
+        return int(self.cells.shape[0])
+
+    def corners(self) -> NDArray[np.float64]:
+        """The four corners (x, y) in metres, counter-clockwise from the origin: float64 [4, 2]."""
+        x, y, yaw = self.origin
+        w, h = self.width * self.resolution, self.height * self.resolution
+        c, s = math.cos(yaw), math.sin(yaw)
+        return np.array([[x + c * u - s * v, y + s * u + c * v] for u, v in ((0, 0), (w, 0), (w, h), (0, h))])
+
+    def counts(self) -> dict[str, int]:
+        """How many cells are occupied (100), free (0), unknown, and anything else."""
+        n = np.bincount(self.cells.ravel(), minlength=256)
+        occupied, free, unknown = int(n[OCCUPIED]), int(n[FREE]), int(n[UNKNOWN])
+        other = int(self.cells.size) - occupied - free - unknown
+        return {"occupied": occupied, "free": free, "unknown": unknown, "other": other}
