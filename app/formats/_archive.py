@@ -1,0 +1,369 @@
+"""Safe ZIP reading and deterministic writing (security, reading 8), for KMZ and for uploads of a zipped folder.
+
+Nothing is ever extracted by name: an archive becomes a mapping of names to bytes in memory. The central directory and
+every local header are read here rather than by ``zipfile``, because the two must agree and ``zipfile`` lets them
+differ. An archive inside an archive stays bytes. Layout: PKWARE APPNOTE 6.3.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import stat
+import struct
+import unicodedata
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from app.errors import Problem, TooLarge, UnreadableFile, UnsafeArchive
+from app.formats import Limits
+
+_END = struct.Struct("<4s4H2LH")
+_END64 = struct.Struct("<4sQ2H2L4Q")
+_LOCATOR64 = struct.Struct("<4sLQL")
+_CENTRAL = struct.Struct("<4s6H3L5H2L")
+_LOCAL = struct.Struct("<4s5H3L2H")
+
+_STORED, _DEFLATED = 0, 8
+_ENCRYPTED = 0x0001 | 0x0040 | 0x2000
+_DESCRIPTOR = 0x0008
+_UTF8 = 0x0800
+_UNIX = (3, 19)
+_MASK16, _MASK32 = 0xFFFF, 0xFFFFFFFF
+_ZIP64, _UNICODE_PATH = 0x0001, 0x7075
+
+_CHUNK = 2**20
+MAX_NAME = 1024
+MAX_DEPTH = 64
+"""Longest path in an archive, in characters and in folders."""
+
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """A member as the central directory tells it. start: of its local header."""
+
+    name: str
+    raw_name: bytes
+    flags: int
+    method: int
+    crc: int
+    packed: int
+    size: int
+    start: int
+    mode: int
+
+    @property
+    def is_folder(self) -> bool:
+        return self.name.endswith("/")
+
+
+def is_archive(data: bytes) -> bool:
+    """Whether the bytes look like a ZIP archive (also an empty one)."""
+    return data[:4] in (b"PK\x03\x04", b"PK\x05\x06")
+
+
+def unpack(data: bytes, limits: Limits) -> dict[str, bytes]:
+    """The archive's files in the order of its central directory; folders are left out.
+
+    Raises UnsafeArchive (links, devices, encryption, overlaps, colliding or escaping names, headers that disagree),
+    TooLarge (more files or bytes than ``limits.files`` and ``limits.unpacked_bytes``; real output is counted) or
+    UnreadableFile (not a ZIP archive, damaged, an unknown compression).
+    """
+    entries, directory = _entries(data, limits)
+    _check_names(entries)
+    declared = sum(e.size for e in entries)
+    if declared > limits.unpacked_bytes:
+        raise TooLarge(
+            f"the archive unfolds to {declared} bytes; the limit is {limits.unpacked_bytes}",
+            [Problem(f"declares {declared} bytes; the limit is {limits.unpacked_bytes}")],
+        )
+    spans = []
+    for entry in entries:
+        start, end = _locate(data, entry, directory)
+        spans.append((entry.start, end, start, entry))
+    spans.sort(key=lambda s: s[0])
+    for (_, end, _, before), (begin, _, _, entry) in itertools.pairwise(spans):
+        if begin < end:
+            raise _unsafe("shares its bytes with another member", f"{before.name} and {entry.name}")
+    places = {entry.name: start for _, _, start, entry in spans}
+    return {e.name: _inflate(data, e, places[e.name]) for e in entries if not e.is_folder}
+
+
+def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:
+    """A ZIP archive of the files: the entry ``first`` leads, the others follow by name; equal files, equal bytes.
+
+    Time stamps and permissions are constants; a file that deflating does not shrink is stored. Raises ValueError for
+    a name that ``unpack`` would refuse.
+    """
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name in sorted(files, key=lambda n: (n != first, n)):
+            reason = bad_name(name)
+            if reason or name.endswith("/"):
+                raise ValueError(f"{name!r} cannot be a name in an archive: it {reason or 'names a folder'}")
+            info = zipfile.ZipInfo(name, _EPOCH)
+            info.create_system = 3
+            info.external_attr = (stat.S_IFREG | 0o644) << 16
+            body = files[name]
+            shrinks = len(zlib.compress(body, 6)) < len(body)
+            info.compress_type = zipfile.ZIP_DEFLATED if shrinks else zipfile.ZIP_STORED
+            archive.writestr(info, body, compresslevel=6)
+    return out.getvalue()
+
+
+def bad_name(name: str) -> str | None:
+    """Why a relative path must not be used, or None: said as ``it …``."""
+    if not name or len(name) > MAX_NAME:
+        return f"has not 1 to {MAX_NAME} characters"
+    if "\\" in name:
+        return "has a backslash"
+    if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
+        return "has control characters"
+    if name.startswith("/") or (len(name) > 1 and name[1] == ":"):
+        return "is absolute"
+    parts = name.removesuffix("/").split("/")
+    if len(parts) > MAX_DEPTH:
+        return f"is nested in more than {MAX_DEPTH} folders"
+    if ".." in parts:
+        return "leaves the archive with .."
+    if "." in parts or "" in parts:
+        return "has an empty or . folder"
+    return None
+
+
+def _unsafe(reason: str, where: str | None = None) -> UnsafeArchive:
+    place = f"{where}: " if where else ""
+    detail = f"unsafe archive: {place}{reason}; pack it anew with plain files"
+    return UnsafeArchive(detail, [Problem(reason, where=where)])
+
+
+def _damaged(reason: str, where: str | None = None) -> UnreadableFile:
+    place = f"{where}: " if where else ""
+    return UnreadableFile(f"damaged or not a ZIP archive: {place}{reason}", [Problem(reason, where=where)])
+
+
+def _end(data: bytes) -> tuple[int, int, int]:
+    """Number of entries, start of the central directory, and its end."""
+    at = data.rfind(b"PK\x05\x06", max(0, len(data) - _END.size - _MASK16))
+    while at >= 0:
+        if at + _END.size <= len(data) and at + _END.size + _END.unpack_from(data, at)[7] == len(data):
+            break
+        at = data.rfind(b"PK\x05\x06", max(0, len(data) - _END.size - _MASK16), at + 3) if at else -1
+    if at < 0:
+        raise _damaged("it has no end of central directory (is it cut off?)")
+    _, disk, first_disk, here, count, size, start, _ = _END.unpack_from(data, at)
+    stop = at
+    at64 = at - _LOCATOR64.size
+    if at64 >= 0 and data[at64 : at64 + 4] == b"PK\x06\x07":
+        _, end_disk, end_at, disks = _LOCATOR64.unpack_from(data, at64)
+        if end_disk or disks > 1 or end_at + _END64.size > at64 or data[end_at : end_at + 4] != b"PK\x06\x06":
+            raise _damaged("its ZIP64 end of central directory is not where it says")
+        _, length, _, _, disk64, first64, here64, count64, size64, start64 = _END64.unpack_from(data, end_at)
+        if end_at + 12 + length != at64:
+            raise _damaged("its ZIP64 end of central directory has another length than it says")
+        for small, large, mask in (
+            (disk, disk64, _MASK16),
+            (first_disk, first64, _MASK16),
+            (here, here64, _MASK16),
+            (count, count64, _MASK16),
+            (size, size64, _MASK32),
+            (start, start64, _MASK32),
+        ):
+            if small not in (mask, large):
+                raise _unsafe("its two ends of central directory disagree")
+        disk, first_disk, here, count, size, start, stop = disk64, first64, here64, count64, size64, start64, end_at
+    if disk or first_disk or here != count:
+        raise _damaged("it is one part of a split archive: join the parts first")
+    if start + size != stop:
+        raise _damaged("its central directory is not where it says")
+    return count, start, stop
+
+
+def _entries(data: bytes, limits: Limits) -> tuple[list[_Entry], int]:
+    """The members in the directory's order, and where the directory starts."""
+    if not is_archive(data):
+        raise _damaged("it does not start like one")
+    count, start, stop = _end(data)
+    if count > limits.files:
+        raise TooLarge(
+            f"the archive has {count} members; the limit is {limits.files}",
+            [Problem(f"{count} members; the limit is {limits.files}")],
+        )
+    out, at = [], start
+    for _ in range(count):
+        if at + _CENTRAL.size > stop:
+            raise _damaged("its central directory is shorter than it says")
+        head = _CENTRAL.unpack_from(data, at)
+        mark, made_by, _, flags, method, _, _, crc, packed, size, n_name, n_extra, n_comment, disk, _, attr, place = (
+            head
+        )
+        begin = at + _CENTRAL.size
+        at = begin + n_name + n_extra + n_comment
+        if mark != b"PK\x01\x02" or at > stop:
+            raise _damaged("its central directory is broken")
+        raw = data[begin : begin + n_name]
+        extra = _extra(data[begin + n_name : begin + n_name + n_extra])
+        name = _decode(raw, flags, made_by >> 8, extra)
+        wide = iter(_wide(extra))
+        try:
+            size = next(wide) if size == _MASK32 else size
+            packed = next(wide) if packed == _MASK32 else packed
+            place = next(wide) if place == _MASK32 else place
+        except StopIteration:
+            raise _damaged("its ZIP64 sizes are missing", name) from None
+        if disk not in (0, _MASK16):
+            raise _damaged("it is one part of a split archive: join the parts first", name)
+        out.append(_Entry(name, raw, flags, method, crc, packed, size, place, attr >> 16))
+    if at != stop:
+        raise _damaged("its central directory is longer than its members")
+    return out, start
+
+
+def _extra(block: bytes) -> dict[int, bytes]:
+    """The extra fields by number. What is left over at the end is ignored, as every reader does."""
+    out: dict[int, bytes] = {}
+    at = 0
+    while at + 4 <= len(block):
+        kind, length = struct.unpack_from("<2H", block, at)
+        if at + 4 + length > len(block):
+            break
+        out.setdefault(kind, block[at + 4 : at + 4 + length])
+        at += 4 + length
+    return out
+
+
+def _wide(extra: Mapping[int, bytes]) -> tuple[int, ...]:
+    """The 8-byte numbers of the ZIP64 field, in the order of the masked fields."""
+    body = extra.get(_ZIP64, b"")
+    return struct.unpack_from(f"<{len(body) // 8}Q", body)
+
+
+def _decode(raw: bytes, flags: int, system: int, extra: Mapping[int, bytes]) -> str:
+    """A member's name: UTF-8 where flagged or told in the Unicode path field, or where a Unix host packed it."""
+    path = extra.get(_UNICODE_PATH, b"")
+    try:
+        if flags & _UTF8:
+            return raw.decode()
+        if path[:1] == b"\x01" and path[1:5] == struct.pack("<L", zlib.crc32(raw)):
+            return path[5:].decode()
+        if system in _UNIX:
+            try:
+                return raw.decode()
+            except UnicodeDecodeError:
+                pass
+        return raw.decode("cp437")
+    except UnicodeDecodeError:
+        raise _unsafe("has a name that is not the UTF-8 it says", repr(raw[:80])) from None
+
+
+def _check_names(entries: list[_Entry]) -> None:
+    """Refuse whatever could escape, collide on some file system, or not be a plain file."""
+    seen: dict[str, _Entry] = {}
+    for e in entries:
+        reason = bad_name(e.name)
+        if reason:
+            raise _unsafe(reason, e.name.encode("unicode_escape").decode()[:200])
+        if e.flags & _ENCRYPTED:
+            raise _unsafe("is encrypted", e.name)
+        kind = stat.S_IFMT(e.mode)
+        if kind not in (0, stat.S_IFREG, stat.S_IFDIR) or (kind and (kind == stat.S_IFDIR) != e.is_folder):
+            raise _unsafe("is a link, a device or a folder in disguise", e.name)
+        if e.is_folder and e.size:
+            raise _unsafe("is a folder with content", e.name)
+        if e.method not in (_STORED, _DEFLATED):
+            raise UnreadableFile(
+                f"{e.name} is packed by method {e.method}; only stored and deflated members are read: pack it anew",
+                [Problem(f"compression method {e.method} is not known", where=e.name)],
+            )
+        key = _fold(e.name)
+        if key in seen:
+            raise _unsafe("has a name that another member has too (on some computers)", e.name)
+        seen[key] = e
+    files = {key for key, e in seen.items() if not e.is_folder}
+    for key, e in seen.items():
+        cut = key.find("/")
+        while cut >= 0:
+            if key[:cut] in files:
+                raise _unsafe("lies in a folder that is also a file", e.name)
+            cut = key.find("/", cut + 1)
+
+
+def _fold(name: str) -> str:
+    """What two names have in common when a file system cannot hold both."""
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name.removesuffix("/")).casefold())
+
+
+def _locate(data: bytes, e: _Entry, directory: int) -> tuple[int, int]:
+    """Start of a member's data, and the end of all that is its own; its local header must agree."""
+    if e.start + _LOCAL.size > directory:
+        raise _damaged("it is not where the directory says", e.name)
+    mark, _, flags, method, _, _, crc, packed, size, n_name, n_extra = _LOCAL.unpack_from(data, e.start)
+    if mark != b"PK\x03\x04":
+        raise _damaged("it is not where the directory says", e.name)
+    begin = e.start + _LOCAL.size
+    extra = _extra(data[begin + n_name : begin + n_name + n_extra])
+    start = begin + n_name + n_extra
+    end = start + e.packed
+    if end > directory:
+        raise _damaged("it ends beyond the archive's data", e.name)
+    later = bool(e.flags & _DESCRIPTOR)
+    wide = _wide(extra)
+    if size == _MASK32 and packed == _MASK32 and len(wide) >= 2:
+        size, packed = wide[:2]
+    agree = (
+        data[begin : begin + n_name] == e.raw_name
+        and flags == e.flags
+        and method == e.method
+        and (crc == e.crc or (later and crc == 0))
+        and (size == e.size or (later and size == 0))
+        and (packed == e.packed or (later and packed == 0))
+    )
+    if not agree or (e.method == _STORED and e.packed != e.size):
+        raise _unsafe("its local header and the directory disagree", e.name)
+    if later:
+        tail = data[end : min(end + 24, directory)]
+        forms = ("<LLL", "<LQQ") if max(e.packed, e.size) <= _MASK32 else ("<LQQ",)
+        for form in forms:
+            body = struct.pack(form, e.crc, e.packed, e.size)
+            for whole in (b"PK\x07\x08" + body, body):
+                if tail.startswith(whole):
+                    return start, end + len(whole)
+        raise _unsafe("its data descriptor and the directory disagree", e.name)
+    return start, end
+
+
+def _inflate(data: bytes, e: _Entry, start: int) -> bytes:
+    """A member's content, never more than it declares."""
+    packed = memoryview(data)[start : start + e.packed]
+    body = bytes(packed) if e.method == _STORED else _deflated(packed, e)
+    if zlib.crc32(body) != e.crc:
+        raise _damaged("its checksum is wrong", e.name)
+    return body
+
+
+def _deflated(packed: memoryview, e: _Entry) -> bytes:
+    """Unpack in pieces, so that neither the input is copied again and again nor the output grows beyond its size."""
+    unpacker = zlib.decompressobj(-zlib.MAX_WBITS)
+    parts, total = [], 0
+    for at in range(0, len(packed), _CHUNK):
+        piece: bytes | memoryview = packed[at : at + _CHUNK]
+        while piece and not unpacker.eof:
+            try:
+                part = unpacker.decompress(piece, min(_CHUNK, e.size + 1 - total))
+            except zlib.error as error:
+                raise _damaged(str(error), e.name) from None
+            piece = unpacker.unconsumed_tail
+            total += len(part)
+            parts.append(part)
+            if total > e.size:
+                raise _unsafe(f"unfolds to more than the {e.size} bytes it declares", e.name)
+        if unpacker.eof:
+            spare = len(unpacker.unused_data) + max(0, len(packed) - at - _CHUNK)
+            if total != e.size or spare:
+                raise _unsafe("has another size than it declares", e.name)
+            return b"".join(parts)
+    raise _damaged("its data is cut off", e.name)
