@@ -8,6 +8,11 @@ plain scalar means follows PyYAML (YAML 1.1), which the robots' own tools use, w
 * ``1e-05`` is a float although PyYAML takes it for a text (Python and C++ print floats so); ``7e12`` is a text
 * keys are the texts as written: ``0``, ``yes`` and ``2022`` are the keys "0", "yes" and "2022"
 
+Two ways lead to the same values: large generated files consist of few different lines in plain block layout, so
+``_load_lines`` understands each distinct line once and puts the rest together at dictionary speed (several times
+faster than any general parser); whatever it does not know, and every error, is left to ``_load_events``, which builds
+the values from libyaml's events. Tests hold that both agree.
+
 Refused, each with its line: NaN and infinities, integers beyond 64 bit, duplicate keys, ``<<``, tags other than
 YAML's own scalars and collections, ``%TAG``, a second document, nesting deeper than ``Limits.yaml_depth``, more than
 ``Limits.yaml_nodes`` nodes, aliases that unfold to much more than the file, aliases to a collection that contains them.
@@ -52,7 +57,11 @@ def load(data: bytes, limits: Limits) -> Any:
     """
     if len(data) > limits.text_bytes:
         raise TooLarge(f"the file has {len(data)} bytes of YAML; the limit is {limits.text_bytes}")
-    return _load_events(data, limits)
+    text = _text(data)
+    try:
+        return _load_lines(text, limits)
+    except _NotSimpleError:
+        return _load_events(text, limits)
 
 
 def scalar(text: str) -> Any:
@@ -108,26 +117,27 @@ def _tagged(tag: str, text: str) -> Any:
     return float(value) if tag == TAG + "float" else value
 
 
-def _load_events(data: bytes, limits: Limits) -> Any:
+def _load_events(text: str, limits: Limits) -> Any:
     """The reference: builds the value from libyaml's event stream, without recursion."""
-    text = _text(data)
     loader: Any = yaml.CSafeLoader(text)
     event: Any = None
-    budget = UNFOLD_FREE + UNFOLD_TIMES * len(data)
+    budget = UNFOLD_FREE + UNFOLD_TIMES * len(text)
     root: list[Any] = []
-    # Open collections, outermost first: [value, pending key, is a mapping, weight, anchor].
+    # Open collections, outermost first: [value, pending key, is a mapping, weight, what its anchor stands for].
     stack: list[list[Any]] = [[root, None, False, 0, None]]
-    anchors: dict[str, tuple[Any, int] | None] = {}
+    # What each name stands for, (value, weight), empty while its collection is open. The last anchor of a name counts.
+    anchors: dict[str, list[tuple[Any, int]]] = {}
     nodes = documents = 0
     try:
         while True:
             event = loader.get_event()
             kind = type(event)
             weight = 0
-            anchor: str | None = None
+            held: list[tuple[Any, int]] | None = None
             if kind is yaml.ScalarEvent:
                 nodes += 1
-                anchor = event.anchor
+                if event.anchor is not None:
+                    held = anchors[event.anchor] = []
                 said: str = event.value
                 top = stack[-1]
                 as_key = top[2] and top[1] is None
@@ -151,18 +161,17 @@ def _load_events(data: bytes, limits: Limits) -> Any:
                 if len(stack) > limits.yaml_depth:
                     raise ValueError(f"nested deeper than {limits.yaml_depth} levels")
                 if event.anchor is not None:
-                    anchors[event.anchor] = None
-                stack.append([{} if mapping else [], None, mapping, 8, event.anchor])
+                    held = anchors[event.anchor] = []
+                stack.append([{} if mapping else [], None, mapping, 8, held])
                 continue
             elif kind is yaml.MappingEndEvent or kind is yaml.SequenceEndEvent:
-                value, _, _, weight, anchor = stack.pop()
+                value, _, _, weight, held = stack.pop()
             elif kind is yaml.AliasEvent:
                 if event.anchor not in anchors:
                     raise ValueError(f"the alias *{event.anchor[:80]} has no anchor before it")
-                known = anchors[event.anchor]
-                if known is None:
+                if not anchors[event.anchor]:
                     raise ValueError(f"the alias *{event.anchor[:80]} stands inside its own anchor")
-                value, weight = known
+                value, weight = anchors[event.anchor][0]
                 nodes += 1
                 budget -= weight
                 if budget < 0:
@@ -180,8 +189,8 @@ def _load_events(data: bytes, limits: Limits) -> Any:
                 continue
             if nodes > limits.yaml_nodes:
                 raise _refuse(f"more than {limits.yaml_nodes} nodes", event.start_mark.line, TooLarge)
-            if anchor is not None:
-                anchors[anchor] = (value, weight)
+            if held is not None:
+                held.append((value, weight))
             top = stack[-1]
             top[3] += weight
             if not top[2]:
@@ -206,6 +215,209 @@ def _load_events(data: bytes, limits: Limits) -> Any:
     finally:
         loader.dispose()
     return root[0] if root else None
+
+
+# --- the quick way ---------------------------------------------------------------------------------------------------
+
+
+class _NotSimpleError(Exception):
+    """A line beyond the plain block layout, or an error: the reference decides."""
+
+
+_WIDE = r"\u00a0-\u1fff\u2030-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff"
+"""Characters beyond ASCII that libyaml takes for themselves anywhere: no further line breaks, no byte order mark."""
+
+_LINE = re.compile(
+    rf"""
+    (?P<indent>\ *) (?P<dash>-\ +)?
+    (?:
+        (?P<key> [A-Za-z_0-9$/](?:[ !"$-9;-~{_WIDE}]{{0,200}}(?<!\ ))? | '[ -&(-~{_WIDE}]{{1,200}}' ) :
+        (?:\ +(?=\S) | \ *$)
+    )?
+    (?:
+        (?P<plain>(?:[A-Za-z_0-9$/(.~] | [-+](?=[0-9.])) (?:[ !"$-9;-~{_WIDE}]*(?<!\ ))?)
+      | '(?P<single>(?:[ -&(-~{_WIDE}] | '')*)'
+      | "(?P<double>[ !\#-\[\]-~{_WIDE}]*)"
+      | (?P<empty>\[\ *\] | \{{\ *\}})
+      | \*(?P<alias>[A-Za-z0-9_]+)
+      | &(?P<anchor>[A-Za-z0-9_]+)
+    )?
+    (?:\ *$ | \ +\#[ -~{_WIDE}]*$)
+    """,
+    re.VERBOSE,
+)
+"""``- key: value``, each of the three optional. A plain value has no ``:`` and no ``#``, a quoted one no escapes."""
+
+_USUAL = re.compile(r"( *)([A-Za-z_]\w{0,200}): (?:(-?[0-9]{1,16}\.[0-9]{1,24})|([A-Za-z_$][\w./$]*))\Z", re.ASCII)
+"""Most lines of most files: a key with a number or a word, which need no further look."""
+
+_BLANK = re.compile(rf" *(?:#[ -~{_WIDE}]*)?\Z")
+
+_OPEN = object()
+"""Nothing stands behind the colon or the dash: what it is shows on the next lines."""
+
+
+class _Alias(str):
+    """The name behind a ``*``, as the value of a line."""
+
+    __slots__ = ()
+
+
+_Line = tuple[int, str | None, Any, tuple[int, bool, int, str | None]]
+"""Where it goes: for ``key: value`` the column, for ``- key: value`` -10 - the column of the dash, for a blank line -3,
+else -2; key; value; (first column, dash?, column of the key, anchor) for the general case."""
+
+
+class _Lines(dict[str, _Line]):
+    """Line -> what it says, understood when first asked for."""
+
+    def __missing__(self, line: str) -> _Line:
+        usual = _USUAL.match(line)
+        if usual:
+            spaces, key, decimal, word = usual.groups()
+            first = len(spaces)
+            value: Any = CONSTANTS.get(word, word) if decimal is None else float(decimal)
+            known: _Line = (first, key, value, (first, False, first, None))
+        elif _BLANK.match(line):
+            known = (-3, None, None, (0, False, 0, None))
+        else:
+            m = _LINE.match(line)
+            if not m:
+                raise _NotSimpleError
+            indent, dash, key, plain, single, double, empty, alias, anchor = m.groups()
+            value = _OPEN
+            if plain is not None:
+                try:
+                    value = scalar(plain)
+                except ValueError:
+                    raise _NotSimpleError from None
+            elif single is not None:
+                value = single.replace("''", "'")
+            elif double is not None:
+                value = double
+            elif empty is not None:
+                value = [] if empty[0] == "[" else {}
+            elif alias is not None:
+                value = _Alias(alias)
+            if key is None:
+                if dash is None:
+                    raise _NotSimpleError
+            elif key[0] == "'":
+                key = key[1:-1]
+            first = len(indent)
+            column = first + len(dash or "")
+            where = -2
+            if key is not None and alias is None and anchor is None:
+                where = first if dash is None else -10 - first
+            known = (where, key, value, (first, dash is not None, column, anchor))
+        self[line] = known
+        return known
+
+
+def _load_lines(text: str, limits: Limits) -> Any:
+    """The value of a document in plain block layout: one key or item a line. _NotSimpleError where it is not."""
+    if "\r" in text:
+        text = text.replace("\r\n", "\n")
+    lines = text.split("\n")
+    if 4 * len(lines) > limits.yaml_nodes:
+        raise _NotSimpleError
+    if lines[0] == "---":
+        lines[0] = ""
+    root: list[Any] = []
+    # Open collections, outermost first: (column, collection, anchored).
+    stack: list[tuple[int, Any, bool]] = [(-1, root, False)]
+    anchors: dict[str, Any] = {}
+    weights: dict[str, int] = {}
+    budget = UNFOLD_FREE + UNFOLD_TIMES * len(text)
+    here: Any = root  # the innermost collection
+    at = -1  # its column, where it is a mapping and no key waits for its value
+    item = -1  # -10 - the column of the dash, where the mapping is an item of a list and no key waits
+    waiting = True  # the last key or dash has no value yet
+    key: str | None = None
+    anchor: str | None = None  # of what is waited for
+    for where, name, value, rest in map(_Lines().__getitem__, lines):
+        if where == at:
+            if name in here:
+                raise _NotSimpleError
+            key = name
+            if value is _OPEN:
+                waiting, at, item = True, -1, -1
+            else:
+                here[key] = value
+            continue
+        if where == item and value is not _OPEN:
+            here = {name: value}
+            at = rest[2]
+            stack[-1] = (at, here, False)
+            stack[-2][1].append(here)
+            continue
+        if where == -3:
+            continue
+        first, dash, inner, its_anchor = rest
+        opened = stack[-1][0]
+        if waiting and (first > opened or (first == opened and dash and type(here) is dict)):
+            new: Any = [] if dash else {}
+            _put(here, key, new)
+            if anchor is not None:
+                anchors[anchor] = new
+            stack.append((first, new, anchor is not None))
+            here = new
+        else:
+            if waiting:
+                if anchor is not None:
+                    raise _NotSimpleError
+                _put(here, key, None)
+            while first < stack[-1][0] or (first == stack[-1][0] and not dash and type(here) is list):
+                stack.pop()
+                here = stack[-1][1]
+            if first != stack[-1][0] or dash != (type(here) is list):
+                raise _NotSimpleError
+        if dash and name is not None:
+            new = {}
+            here.append(new)
+            stack.append((inner, new, False))
+            here = new
+        if len(stack) - 1 > limits.yaml_depth or (name is not None and name in here):
+            raise _NotSimpleError
+        key, anchor = name, its_anchor
+        if anchor is not None and anchor in anchors:
+            raise _NotSimpleError
+        waiting = value is _OPEN
+        if type(value) is _Alias:
+            # An alias below an anchor is left to the reference, so the weights need no care for aliases in aliases.
+            if value not in anchors or any(anchored for _, _, anchored in stack):
+                raise _NotSimpleError
+            if value not in weights:
+                weights[value] = _weight(anchors[value])
+            budget -= weights[value]
+            if budget < 0:
+                raise _NotSimpleError
+            _put(here, key, anchors[value])
+        elif not waiting:
+            _put(here, key, value)
+        at = stack[-1][0] if type(here) is dict and not waiting else -1
+        item = -10 - first if dash and name is not None and not waiting else -1
+    if waiting:
+        if anchor is not None:
+            raise _NotSimpleError
+        _put(here, key, None)
+    return root[0]
+
+
+def _put(collection: Any, key: str | None, value: Any) -> None:
+    if key is None or type(collection) is list:
+        collection.append(value)
+    else:
+        collection[key] = value
+
+
+def _weight(value: Any) -> int:
+    """At least what the reference counts for a value: characters, and 8 for each node."""
+    if isinstance(value, dict):
+        return 8 + sum(8 + len(k) + _weight(v) for k, v in value.items())
+    if isinstance(value, list):
+        return 8 + sum(map(_weight, value))
+    return 8 + (len(value) if isinstance(value, str) else LONGEST_NUMBER)
 
 
 def _text(data: bytes) -> str:
