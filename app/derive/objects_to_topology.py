@@ -1,0 +1,72 @@
+"""Drawn lines -> topology, so that a network drawn in Google Earth or QGIS can be had in a robot's format."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.derive import derives
+from app.errors import MissingLayer
+from app.model import network
+from app.model.features import Features, concatenate, unique_ids
+from app.model.layers import NETWORK, Layers, Part, PartKey
+from app.parameters import parameter
+
+DRAWINGS = frozenset({"kml", "kmz", "geojson"})
+"""Format families whose lines are paths unless told otherwise. Elsewhere a line is one only where its kind says so:
+a building's walls and doors are lines too."""
+
+RAW = frozenset({"osm"})
+"""Format families that bring their own topology."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """How lines become a network."""
+
+    join: float = parameter(
+        network.JOIN, "vertices nearer than this become one node", minimum=0.0, maximum=100.0, unit="m"
+    )
+    outlines: bool = parameter(False, "whether the outlines of polygons are paths too")
+
+
+@derives(gives="topology", needs={"objects"}, parameters=Parameters, cost=1.0)
+def objects_to_topology(layers: Layers, parameters: Parameters) -> Layers:
+    """Drawn lines and points of interest as a network of nodes and directed edges.
+
+    One network for each level, from all its drawings. Raises MissingLayer where there is nothing to make it from.
+    """
+    by_level: dict[str, list[tuple[str, Features]]] = {}
+    for key, part in layers.vector("objects").items():
+        if key.name in RAW:
+            continue
+        chosen = part if key.name in DRAWINGS else part.of_kind("path", "poi")
+        if len(chosen):
+            by_level.setdefault(key.level, []).append((key.name, chosen))
+    parts: dict[PartKey, Part] = {}
+    for level, drawings in by_level.items():
+        made = _network([part for _, part in drawings], layers, parameters)
+        if len(made):
+            parts[PartKey("topology", level, NETWORK)] = made
+    if not parts:
+        raise MissingLayer(
+            "a network can be made from drawn lines and points of interest, but the stored objects have none: upload "
+            "a network (tmap2, osm …) or a KML or GeoJSON drawing with paths as lines; where the paths were drawn as "
+            "polygons, ask with outlines=true"
+        )
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def _network(drawings: list[Features], layers: Layers, parameters: Parameters) -> Features:
+    """One network from several drawings, whose objects may share ids."""
+    origins = tuple(i for part in drawings for i in part.ids)
+    ids = iter(unique_ids(origins))
+    renamed = [Features(tuple(next(ids) for _ in p.ids), p.geometry, p.properties, np.array(p.local)) for p in drawings]
+    return network.from_drawing(
+        concatenate(renamed),
+        join=parameters.join,
+        frame=layers.frame,
+        outlines=parameters.outlines,
+        origins=origins,
+    )
