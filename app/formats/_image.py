@@ -1,0 +1,354 @@
+"""Pictures read safely and PNG written quickly: what grids, overlays and floor plans share (security, reading 7).
+
+A picture is known by its first bytes, never by its name; its size is checked before a pixel is decoded; a damaged one
+is refused, never half read. Read: PGM (P2, P5) and raw PBM and PPM (P4, P6), PNG, BMP, JPEG.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from app.errors import TooLarge, UnreadableFile
+from app.formats import Limits
+from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
+
+Bytes = NDArray[np.uint8]
+
+# Pillow's own bound would refuse pictures that the settings allow; every picture is checked in _check_size instead.
+Image.MAX_IMAGE_PIXELS = None
+
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+STRIP = 2**18
+"""Pixels that are converted at a time: small enough for the processor's cache, so memory stays near the result's."""
+
+MAX_JPEG_SCANS = 64
+DEFLATE_RATIO = 1032
+"""No deflate stream unfolds further than this (RFC 1951: 258 bytes for 2 bits)."""
+
+RED, GREEN, BLUE = 298839, 586811, 114350
+"""Millionths: GraphicsMagick's weights of a grey value, as Nav2 sees a coloured picture with transparency."""
+
+_LONG_NUMBER = re.compile(rb"[0-9]{10}")
+
+Strips = Iterator[tuple[int, Bytes, NDArray[np.bool_] | None]]
+
+
+@dataclass(frozen=True, slots=True)
+class Grey:
+    """A decoded picture as 8-bit grey.
+
+    strips: gives (first row, grey uint8 [rows, width], opaque bool [rows, width] or None where every pixel is), from
+    the top row down. A picture may only turn out damaged while its strips are read (UnreadableFile).
+    """
+
+    width: int
+    height: int
+    strips: Callable[[], Strips]
+
+    def pixels(self) -> tuple[Bytes, NDArray[np.bool_] | None]:
+        """All of it: grey and opaque [height, width], top row first."""
+        grey = np.empty((self.height, self.width), np.uint8)
+        opaque: NDArray[np.bool_] | None = None
+        for y, block, clear in self.strips():
+            grey[y : y + len(block)] = block
+            if clear is not None:
+                if opaque is None:
+                    opaque = np.ones(grey.shape, bool)
+                opaque[y : y + len(block)] = clear
+        return grey, opaque
+
+
+def kind_of(data: bytes) -> str | None:
+    """``pgm`` (all of PBM, PGM, PPM), ``png``, ``bmp`` or ``jpeg`` by the first bytes; None for anything else."""
+    if data[:8] == PNG_MAGIC:
+        return "png"
+    if data[:3] == b"\xff\xd8\xff":
+        return "jpeg"
+    if data[:2] == b"BM" and len(data) >= 26:
+        return "bmp"
+    if data[:1] == b"P" and data[1:2] in b"123456" and data[2:3] and data[2:3] in b" \t\r\n\v\f#":
+        return "pgm"
+    return None
+
+
+def read_grey(data: bytes, limits: Limits) -> Grey:
+    """A picture as grey, as GraphicsMagick and so Nav2 sees it. Raises UnreadableFile or TooLarge."""
+    if kind_of(data) == "pgm" and data[:2] in (b"P2", b"P5"):
+        return _read_pgm(data, limits)
+    image = read_image(data, limits)
+    return Grey(image.width, image.height, lambda: _image_strips(image))
+
+
+def read_image(data: bytes, limits: Limits) -> Image.Image:
+    """A picture, decoded, in the mode it is stored in. Raises UnreadableFile or TooLarge.
+
+    16-bit greys have mode ``I;16``; transparency is in the alpha band or in ``info["transparency"]``.
+    """
+    kind = kind_of(data)
+    if kind is None:
+        raise UnreadableFile("its first bytes are not those of a PGM, PNG, BMP or JPEG picture")
+    if kind == "pgm" and data[:2] in (b"P1", b"P3"):
+        raise UnreadableFile("a PBM or PPM in plain text is not read: save it as PGM (P5) or PNG")
+    if kind == "pgm" and data[:2] in (b"P2", b"P5"):
+        pixels, _ = _read_pgm(data, limits).pixels()
+        return Image.fromarray(pixels)
+    if kind == "png":
+        data = _checked_png(data, limits)
+    elif kind == "jpeg":
+        _check_jpeg(data)
+    names = {"png": "PNG", "jpeg": "JPEG", "bmp": "BMP", "pgm": "PPM"}
+    # struct.error, SyntaxError and the like: what Pillow raises on input that is not what it says.
+    try:
+        image = Image.open(io.BytesIO(data), formats=[names[kind]])
+        _check_size(image.width, image.height, limits)
+        if kind == "bmp" and image.info.get("compression") == 0:
+            _check_bmp(image, data)
+        image.load()
+    except (OSError, SyntaxError, ValueError, LookupError, TypeError, EOFError, struct.error, zlib.error) as error:
+        reason = str(error) or type(error).__name__
+        raise UnreadableFile(f"the {names[kind]} picture is damaged or cut short: {reason}") from error
+    return image
+
+
+def encode_png(pixels: Bytes, *, flip: bool = False, palette: Bytes | None = None, table: bytes | None = None) -> bytes:
+    """A PNG of uint8 [height, width] or [height, width, 1…4] (grey, grey + alpha, RGB, RGBA), the same every time.
+
+    flip: the first row is the bottom one. palette: RGBA [256, 4] that one-band pixels index. table: 256 bytes that
+    every byte is looked up in first.
+    """
+    height, width = pixels.shape[:2]
+    bands = 1 if pixels.ndim == 2 else pixels.shape[2]
+    colour = 3 if palette is not None else {1: 0, 2: 4, 3: 2, 4: 6}[bands]
+    out = [PNG_MAGIC, _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, colour, 0, 0, 0))]
+    if palette is not None:
+        out += [_chunk(b"PLTE", palette[:, :3].tobytes()), _chunk(b"tRNS", palette[:, 3].tobytes())]
+    # Grids are runs of few values: matching runs alone is as quick as the fastest general level, half the size, and
+    # keeps to filter 0.
+    packer = zlib.compressobj(1, zlib.DEFLATED, 15, 9, zlib.Z_RLE if bands == 1 else zlib.Z_DEFAULT_STRATEGY)
+    rows = max(1, STRIP // (width * bands))
+    packed = []
+    for y in range(0, height, rows):
+        end = min(height, y + rows)
+        block = pixels[height - end : height - y][::-1] if flip else pixels[y:end]
+        lines = np.zeros((end - y, 1 + width * bands), np.uint8)
+        lines[:, 1:] = block.reshape(end - y, width * bands)
+        if table is not None:
+            lines[:, 1:] = look_up(lines[:, 1:], table)
+        packed.append(packer.compress(lines.data))
+    packed.append(packer.flush())
+    body = b"".join(packed)
+    limit = 2**30
+    out += [_chunk(b"IDAT", body[i : i + limit]) for i in range(0, len(body), limit)]
+    return b"".join([*out, _chunk(b"IEND", b"")])
+
+
+def png_of_cells(cells: Bytes) -> bytes:
+    """A grey PNG of canonical cells (bottom row first): the value 0…100, 255 unknown; the top row of the map on top."""
+    return encode_png(cells, flip=True)
+
+
+def overlay_png(grid: OccupancyGrid) -> bytes:
+    """A grid as a picture to lay over a map: occupied black, free white, in between grey, unknown transparent.
+
+    Row 0 is the map's top row; a grid with a yaw is drawn unturned (its corners say how it lies).
+    """
+    palette = np.zeros((256, 4), np.uint8)
+    palette[: OCCUPIED + 1, :3] = np.round(255 * (1 - np.arange(OCCUPIED + 1) / OCCUPIED))[:, None].astype(np.uint8)
+    palette[:, 3] = 255
+    palette[UNKNOWN] = 0
+    return encode_png(grid.cells, flip=True, palette=palette)
+
+
+def look_up(pixels: Bytes, table: bytes) -> Bytes:
+    """table[pixels]: bytes.translate takes a third of the time of numpy's indexing. The result is read-only."""
+    return np.frombuffer(pixels.tobytes().translate(table), np.uint8).reshape(pixels.shape)
+
+
+def _check_size(width: int, height: int, limits: Limits) -> None:
+    if width < 1 or height < 1:
+        raise UnreadableFile(f"the picture says it has {width} × {height} pixels")
+    if width * height > limits.pixels:
+        raise TooLarge(
+            f"the picture says it has {width} × {height} = {width * height} pixels; the limit is {limits.pixels} "
+            "(FLEETMAP_MAX_PIXELS)"
+        )
+
+
+# --- PGM ----------------------------------------------------------------------------------------------------------
+def _read_pgm(data: bytes, limits: Limits) -> Grey:
+    """P2 and P5 by netpbm's rules: white space and comments between the numbers, one white space before the pixels."""
+    at, numbers = 2, []
+    for what in ("width", "height", "highest value"):
+        at = _skip_blank(data, at)
+        end = at
+        while end < at + 10 and data[end : end + 1].isdigit():
+            end += 1
+        if end == at or end == at + 10:
+            raise UnreadableFile(f"the PGM's {what} is not a number of up to 9 digits (at byte {at})")
+        numbers.append(int(data[at:end]))
+        at = end
+    width, height, most = numbers
+    if not 1 <= most <= 65535:
+        raise UnreadableFile(f"the PGM's highest value is {most}; it must be 1 to 65535")
+    _check_size(width, height, limits)
+    if data[at : at + 1] not in (b" ", b"\t", b"\r", b"\n", b"\v", b"\f"):
+        raise UnreadableFile("the PGM ends after its header" if at >= len(data) else "the PGM's header is damaged")
+    at += 1
+    count = width * height
+    values: NDArray[np.integer]
+    if data[:2] == b"P2":
+        if len(data) > limits.text_bytes:
+            raise TooLarge(f"the plain PGM has {len(data)} bytes; the limit is {limits.text_bytes}: save it as P5")
+        values = _plain_numbers(data[at:], count)
+    else:
+        size = count * (1 if most < 256 else 2)
+        if len(data) - at < size:
+            raise UnreadableFile(
+                f"the PGM is cut short: {width} × {height} pixels are {size} bytes, it has {len(data) - at}"
+            )
+        values = np.frombuffer(data, np.uint8 if most < 256 else ">u2", count, at)
+    rows = values.reshape(height, width)
+    table = None if most == 255 else _scaling(most)
+
+    def strips() -> Strips:
+        step = max(1, STRIP // width)
+        for y in range(0, height, step):
+            block = rows[y : y + step]
+            top = most if most in (255, 65535) and data[:2] == b"P5" else int(block.max())
+            if top > most:
+                raise UnreadableFile(f"the PGM has the value {top}, above the highest it declares ({most})")
+            yield y, (block.astype(np.uint8, copy=False) if table is None else table[block]), None
+
+    return Grey(width, height, strips)
+
+
+def _skip_blank(data: bytes, at: int) -> int:
+    """The next byte that is neither white space nor in a comment."""
+    while at < len(data):
+        if data[at] == 0x23:
+            ends = [end for end in (data.find(b"\n", at), data.find(b"\r", at)) if end >= 0]
+            if not ends:
+                return len(data)
+            at = min(ends)
+        elif data[at] not in b" \t\r\n\v\f":
+            return at
+        else:
+            at += 1
+    return at
+
+
+def _plain_numbers(text: bytes, count: int) -> NDArray[np.int32]:
+    """The first ``count`` numbers of a P2's pixels; comments may stand between them."""
+    if len(text) < 2 * count - 1:
+        raise UnreadableFile(f"the PGM is cut short: {count} pixels need more than {len(text)} characters")
+    if b"#" in text:
+        text = b"\n".join(line.partition(b"#")[0] for line in text.splitlines())
+    stray = text.translate(None, b"0123456789 \t\r\n\v\f")
+    if stray:
+        raise UnreadableFile(f"the PGM's pixels must be whole numbers; found {stray[:20].decode('latin1')!r}")
+    # Digits and blanks only, and none too long for 32 bit, so that fromstring reads to the end without a surprise.
+    if _LONG_NUMBER.search(text):
+        raise UnreadableFile("the PGM has a pixel of more than 9 digits")
+    # Without a count: given one that the text cannot fill, fromstring answers uninitialised memory.
+    values: NDArray[np.int32] = np.fromstring(text, np.int32, sep=" ") if text.strip() else np.empty(0, np.int32)
+    if len(values) < count:
+        raise UnreadableFile(f"the PGM is cut short: it has {len(values)} of {count} pixels")
+    return values[:count]
+
+
+def _scaling(most: int) -> Bytes:
+    """0…most to 0…255 as GraphicsMagick does: to 16 bit, then to 8, each rounded."""
+    value = np.minimum(np.arange(256 if most < 256 else 65536, dtype=np.int64), most)
+    return (((65535 * value + most // 2) // most + 128) // 257).astype(np.uint8)
+
+
+# --- pictures that Pillow decodes ---------------------------------------------------------------------------------
+def _image_strips(image: Image.Image) -> Strips:
+    width, height = image.size
+    step = max(1, STRIP // width)
+    clear = image.mode in ("LA", "RGBA", "PA", "La", "RGBa") or "transparency" in image.info
+    for y in range(0, height, step):
+        part = image.crop((0, y, width, min(height, y + step)))
+        if image.mode.startswith("I"):
+            deep = np.asarray(part).astype(np.uint32)
+            see_through = image.info.get("transparency")
+            opaque = deep != see_through if isinstance(see_through, int) else None
+            yield y, ((deep + 128) // 257).astype(np.uint8), opaque
+        elif not clear:
+            yield y, np.asarray(part if part.mode == "L" else part.convert("L")), None
+        else:
+            yield y, *_grey_and_opaque(np.asarray(part.convert("RGBA")))
+
+
+def _grey_and_opaque(rgba: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
+    word = np.ascontiguousarray(rgba).view("<u4")[..., 0]
+    opaque: NDArray[np.bool_] = word >= 0xFF000000
+    red = word & 0xFF
+    if bool(((word & 0xFFFFFF) == red * 0x010101).all()):
+        return red.astype(np.uint8), opaque
+    total = red * RED + ((word >> 8) & 0xFF) * GREEN + ((word >> 16) & 0xFF) * BLUE
+    return ((total + 500_000) // 1_000_000).astype(np.uint8), opaque
+
+
+def _checked_png(data: bytes, limits: Limits) -> bytes:
+    """The PNG with only the chunks that make its pixels, each one's checksum verified (Pillow skips that of IDAT)."""
+    at, kept, packed = 8, [data[:8]], 0
+    width = height = depth = colour = 0
+    while True:
+        if at + 12 > len(data):
+            raise UnreadableFile("the PNG picture is cut short")
+        size = int.from_bytes(data[at : at + 4], "big")
+        kind, end = data[at + 4 : at + 8], at + 12 + size
+        if end > len(data):
+            raise UnreadableFile("the PNG picture is cut short")
+        if zlib.crc32(memoryview(data)[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            raise UnreadableFile(f"the PNG picture is damaged: wrong checksum of its chunk {kind!r} at byte {at}")
+        if len(kept) == 1:
+            if kind != b"IHDR" or size != 13:
+                raise UnreadableFile("the PNG picture does not begin with its header")
+            width, height, depth, colour = struct.unpack(">IIBB", data[16:26])
+            _check_size(width, height, limits)
+        if kind in (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"):
+            kept.append(data[at:end])
+            packed += size if kind == b"IDAT" else 0
+        elif not kind[0] & 0x20:
+            raise UnreadableFile(f"the PNG picture needs the unknown chunk {kind!r}")
+        at = end
+        if kind == b"IEND":
+            break
+    bits = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 1) * depth
+    if (width * bits // 8) * height > packed * DEFLATE_RATIO:
+        raise UnreadableFile(f"the PNG picture says {width} × {height} pixels, but {packed} bytes cannot hold them")
+    return b"".join(kept)
+
+
+def _check_jpeg(data: bytes) -> None:
+    """Few scans (each costs a pass over the whole picture), and an end: a cut one would come out half grey."""
+    scans = data.count(b"\xff\xda")
+    if scans > MAX_JPEG_SCANS:
+        raise TooLarge(f"the JPEG picture has {scans} scans; the limit is {MAX_JPEG_SCANS}")
+    if data.find(b"\xff\xd9", max(2, data.rfind(b"\xff\xda"))) < 0:
+        raise UnreadableFile("the JPEG picture is cut short: its end is missing")
+
+
+def _check_bmp(image: Image.Image, data: bytes) -> None:
+    """An uncompressed BMP must hold the pixels it declares."""
+    bits = int.from_bytes(data[28:30], "little") if int.from_bytes(data[14:18], "little") >= 40 else 1
+    size = ((image.width * bits + 31) // 32) * 4 * image.height
+    if len(data) < size:
+        raise UnreadableFile(
+            f"the BMP picture is cut short: {image.width} × {image.height} pixels are {size} bytes, it has {len(data)}"
+        )
+
+
+def _chunk(kind: bytes, body: bytes) -> bytes:
+    return b"".join([struct.pack(">I", len(body)), kind, body, struct.pack(">I", zlib.crc32(body, zlib.crc32(kind)))])

@@ -1,0 +1,329 @@
+"""Pictures: what comes out equals Pillow's own reading; damaged or lying ones are refused; PNG is written whole."""
+
+from __future__ import annotations
+
+import io
+import random
+import struct
+import tracemalloc
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from app.errors import BadUpload, TooLarge, UnreadableFile
+from app.formats import Limits, _image
+from app.model.grid import OccupancyGrid
+
+LIMITS = Limits()
+RANDOM = np.random.default_rng(7)
+SHADES = RANDOM.integers(0, 256, (37, 53), np.uint8)
+COLOURS = RANDOM.integers(0, 256, (37, 53, 3), np.uint8)
+
+
+def saved(image: Image.Image, kind: str, **options: Any) -> bytes:
+    out = io.BytesIO()
+    image.save(out, kind, **options)
+    return out.getvalue()
+
+
+def grey(data: bytes) -> np.ndarray:
+    return _image.read_grey(data, LIMITS).pixels()[0]
+
+
+def chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def png(width: int, height: int, packed: bytes, depth: int = 8, colour: int = 0, extra: bytes = b"") -> bytes:
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0))
+    return _image.PNG_MAGIC + header + extra + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
+
+
+def pictures() -> dict[str, bytes]:
+    """One of each kind, all 53 × 37."""
+    grey8, rgb = Image.fromarray(SHADES), Image.fromarray(COLOURS)
+    rgba = rgb.convert("RGBA")
+    rgba.putalpha(Image.fromarray(np.where(SHADES > 128, 255, SHADES).astype(np.uint8)))
+    la = grey8.convert("LA")
+    la.putalpha(Image.fromarray(np.where(SHADES[::-1] > 60, 255, 0).astype(np.uint8)))
+    palette = rgb.quantize(17)
+    deep = Image.fromarray(RANDOM.integers(0, 65536, SHADES.shape).astype(np.uint16))
+    return {
+        "L.png": saved(grey8, "png"),
+        "RGB.png": saved(rgb, "png"),
+        "RGBA.png": saved(rgba, "png"),
+        "LA.png": saved(la, "png"),
+        "P.png": saved(palette, "png"),
+        "P transparent.png": saved(palette, "png", transparency=3),
+        "L transparent.png": saved(Image.fromarray(SHADES // 16), "png", transparency=5),
+        "1.png": saved(grey8.convert("1"), "png"),
+        "I;16.png": saved(deep, "png"),
+        "L.pgm": saved(grey8, "ppm"),
+        "RGB.ppm": saved(rgb, "ppm"),
+        "1.pbm": saved(grey8.convert("1"), "ppm"),
+        "L.bmp": saved(grey8, "bmp"),
+        "RGB.bmp": saved(rgb, "bmp"),
+        "1.bmp": saved(grey8.convert("1"), "bmp"),
+        "L.jpg": saved(grey8, "jpeg"),
+        "RGB.jpg": saved(rgb, "jpeg"),
+        "progressive.jpg": saved(rgb, "jpeg", progressive=True),
+    }
+
+
+@pytest.mark.parametrize("name", pictures())
+def test_every_kind_reads_as_an_independent_reader_sees_it(name: str, facts: Any) -> None:
+    data = pictures()[name]
+    shades, opaque = _image.read_grey(data, LIMITS).pixels()
+    expected, alpha = facts.grey(Image.open(io.BytesIO(data)))
+    # Ties of a coloured pixel's weighted sum fall on either side.
+    assert np.abs(shades.astype(int) - expected).max() <= (1 if alpha is not None else 0)
+    assert (shades != expected).mean() < 1e-3
+    if alpha is None:
+        assert opaque is None or opaque.all()
+    else:
+        assert opaque is not None
+        assert (opaque == (alpha == 255)).all()
+        assert not opaque.all()
+
+
+def test_deep_grey_png_with_a_transparent_value() -> None:
+    rows = np.array([[0, 257, 65535]], ">u2")
+    packed = zlib.compress(b"\0" + rows.tobytes())
+    data = png(3, 1, packed, depth=16, extra=chunk(b"tRNS", struct.pack(">H", 257)))
+    shades, opaque = _image.read_grey(data, LIMITS).pixels()
+    assert shades.tolist() == [[0, 1, 255]]
+    assert opaque is not None
+    assert opaque.tolist() == [[True, False, True]]
+
+
+@pytest.mark.parametrize("most", [1, 2, 3, 7, 15, 100, 127, 254, 255, 256, 1000, 4095, 65535])
+@pytest.mark.parametrize("magic", ["P2", "P5"])
+def test_pgm_of_any_depth(magic: str, most: int, facts: Any) -> None:
+    values = np.unique(np.linspace(0, most, 300).astype(int))
+    header = f"{magic}\n# made by a test\n{len(values)} 1 #width\n# and\r\n\t{most}\n".encode()
+    body = (
+        " ".join(map(str, values)).encode() if magic == "P2" else values.astype(">u2" if most > 255 else "u1").tobytes()
+    )
+    data = header + body
+    expected, _ = facts.grey(Image.open(io.BytesIO(data)))
+    # Where 255 v / most ends in .5 the reader that the facts come from rounds to even, GraphicsMagick up.
+    assert np.abs(grey(data).astype(int) - expected).max() <= 1
+    assert (grey(data) != expected).mean() < 0.05
+    assert grey(data)[0].tolist() == [(int(65535 * int(v) / most + 0.5) + 128) // 257 for v in values]
+    assert grey(data)[0, 0] == 0
+    assert grey(data)[0, -1] == 255
+
+
+def test_plain_and_binary_pgm_are_equal(shared: Path) -> None:
+    folder = shared / "data/occupancy_grid/joctomap_ecmr"
+    plain, binary = (grey((folder / f"ecmr_{n}.pgm").read_bytes()) for n in ("ascii", "binary"))
+    assert plain.shape == (473, 504)
+    assert (plain == binary).all()
+
+
+def test_comments_between_the_numbers_of_a_plain_pgm() -> None:
+    assert grey(b"P2 # x\n2 2 255\n1 2 # 9 9\n3# 7\n 4\n").tolist() == [[1, 2], [3, 4]]
+
+
+def test_what_follows_the_pixels_is_another_picture() -> None:
+    assert grey(b"P5 2 1 255\n\x01\x02P5 1 1 255\n\x03").tolist() == [[1, 2]]
+    assert grey(b"P2 2 1 255\n1 2 3 4").tolist() == [[1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "first bytes"),
+        (b"GIF89a", "first bytes"),
+        (b"P9 1 1 255\n", "first bytes"),
+        (b"P1 1 1\n0", "PBM or PPM"),
+        (b"P5 ", "width"),
+        (b"P5 2", "height"),
+        (b"P5 2 2", "highest value"),
+        (b"P5 2 2 255", "ends after its header"),
+        (b"P5 2 2 255x....", "damaged"),
+        (b"P5 2 2 255\n...", "cut short"),
+        (b"P5 2 2 0\n....", "highest value is 0"),
+        (b"P5 2 2 65536\n........", "highest value is 65536"),
+        (b"P5 0 2 255\n", "0 × 2"),
+        (b"P5 -1 2 255\n", "width"),
+        (b"P5 1 1 100\n\xff", "above the highest"),
+        (b"P2 1 1 255\n256", "above the highest"),
+        (b"P2 2 1 255\n1", "cut short"),
+        (b"P2 2 1 255\n1 # 2 3 4", "cut short"),
+        (b"P2 2 1 255\n1 -2", "whole numbers"),
+        (b"P2 2 1 255\n1 4294967298", "9 digits"),
+        (b"P5 1" + b"0" * 5000, "width"),
+        (b"P5 2 2 # no end" + b" " * 100, "highest value"),
+        (b"BM" + b"\0" * 60, "damaged"),
+        (b"\xff\xd8\xff\xe0", "cut short"),
+    ],
+)
+def test_bad_bytes_say_why(data: bytes, reason: str) -> None:
+    with pytest.raises(UnreadableFile, match=reason):
+        grey(data)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"P5 100000 100000 255\n" + b"\0" * 1000,
+        b"P2 999999999 999999999 255\n0",
+        png(100_000, 100_000, zlib.compress(b"\0" * 1000)),
+        png(2**31 - 1, 2**31 - 1, b""),
+        saved(Image.fromarray(SHADES), "bmp")[:18] + struct.pack("<ii", 10**5, 10**5) + b"\x01\0\x08\0" + b"\0" * 1000,
+    ],
+    ids=["P5", "P2", "PNG", "largest PNG", "BMP"],
+)
+def test_ten_gigabytes_in_a_kilobyte_are_refused_before_decoding(data: bytes) -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises(TooLarge, match="limit is"):
+            _image.read_grey(data, LIMITS).pixels()
+        assert tracemalloc.get_traced_memory()[1] < 10 * 2**20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_legal_size_that_the_bytes_cannot_hold_is_refused_before_decoding() -> None:
+    with pytest.raises(UnreadableFile, match="cannot hold"):
+        grey(png(16_000, 16_000, zlib.compress(b"\0" * 10_000)))
+
+
+def test_a_bomb_unfolds_no_further_than_its_declared_size() -> None:
+    packer = zlib.compressobj(9)
+    packed = b"".join([packer.compress(bytes(2**20)) for _ in range(570)] + [packer.flush()])
+    assert len(packed) < 600_000
+    assert grey(png(10, 10, packed)).tolist() == [[0] * 10] * 10  # what follows the last row is never unfolded
+    with pytest.raises(TooLarge):
+        _image.read_grey(png(23_875, 25_000, packed), LIMITS)
+
+
+def test_text_and_profile_bombs_are_left_aside() -> None:
+    bomb = zlib.compress(bytes(200 * 2**20))
+    extra = chunk(b"zTXt", b"a\0\0" + bomb) + chunk(b"iCCP", b"a\0\0" + bomb)
+    assert grey(png(1, 1, zlib.compress(b"\0\7"), extra=extra)).tolist() == [[7]]
+
+
+def test_a_jpeg_of_many_scans_is_refused() -> None:
+    data = pictures()["progressive.jpg"]
+    start = data.index(b"\xff\xda")
+    scan = data[start : data.index(b"\xff", start + 2)]
+    with pytest.raises(TooLarge, match="scans"):
+        grey(data[:-2] + scan * 80 + data[-2:])
+
+
+def test_an_unknown_critical_chunk_and_a_late_header_are_refused() -> None:
+    with pytest.raises(UnreadableFile, match="unknown chunk"):
+        grey(png(1, 1, zlib.compress(b"\0\7"), extra=chunk(b"ABCD", b"")))
+    with pytest.raises(UnreadableFile, match="begin with its header"):
+        grey(_image.PNG_MAGIC + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
+
+
+@pytest.mark.parametrize("name", pictures())
+def test_a_cut_picture_is_refused_or_whole(name: str) -> None:
+    data = pictures()[name]
+    whole, opaque = _image.read_grey(data, LIMITS).pixels()
+    refused = 0
+    for end in sorted({*range(0, len(data), max(1, len(data) // 60)), *range(max(0, len(data) - 20), len(data))}):
+        try:
+            cut, clear = _image.read_grey(data[:end], LIMITS).pixels()
+        except BadUpload:
+            refused += 1
+        else:
+            assert (cut == whole).all()
+            assert (clear is None) == (opaque is None)
+    assert refused > 50
+
+
+@pytest.mark.parametrize("name", pictures())
+def test_a_flipped_bit_never_crashes_and_a_png_never_lies(name: str) -> None:
+    data = pictures()[name]
+    whole = grey(data)
+    dice = random.Random(name)
+    for _ in range(60):
+        damaged = bytearray(data)
+        damaged[dice.randrange(len(damaged))] ^= 1 << dice.randrange(8)
+        try:
+            shades = grey(bytes(damaged))
+        except BadUpload:
+            continue
+        if name.endswith(".png"):
+            assert (shades == whole).all()  # every byte of a chunk is under its checksum
+
+
+@given(
+    st.binary(max_size=300),
+    st.sampled_from([b"", b"P5 ", b"P2 ", b"P5 3 3 255\n", _image.PNG_MAGIC, b"BM", b"\xff\xd8\xff"]),
+)
+@settings(max_examples=300, deadline=None)
+def test_any_bytes_are_refused_or_read(body: bytes, head: bytes) -> None:
+    try:
+        found = _image.read_grey(head + body, Limits(pixels=10_000))
+        shades, _ = found.pixels()
+    except BadUpload:
+        return
+    assert shades.shape == (found.height, found.width)
+
+
+@pytest.mark.parametrize("bands", [1, 2, 3, 4])
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize("shape", [(1, 1), (3, 5), (1200, 700)])
+def test_written_png_reads_back(bands: int, flip: bool, shape: tuple[int, int]) -> None:
+    pixels = RANDOM.integers(0, 256, (*shape, bands), np.uint8)
+    pixels = pixels[..., 0] if bands == 1 else pixels
+    data = _image.encode_png(pixels, flip=flip)
+    assert data == _image.encode_png(pixels.copy(), flip=flip)
+    image = Image.open(io.BytesIO(data))
+    assert image.mode == {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[bands]
+    assert (np.asarray(image) == (pixels[::-1] if flip else pixels)).all()
+    assert (np.asarray(_image.read_image(data, LIMITS)) == np.asarray(image)).all()
+
+
+def test_a_table_is_looked_up_while_writing() -> None:
+    table = bytes(255 - v for v in range(256))
+    data = _image.encode_png(SHADES, table=table)
+    assert (np.asarray(Image.open(io.BytesIO(data))) == 255 - SHADES).all()
+    assert (_image.look_up(SHADES, table) == 255 - SHADES).all()
+
+
+def test_png_of_cells_has_the_top_row_on_top() -> None:
+    cells = np.array([[0, 100, 255], [1, 2, 3]], np.uint8)
+    image = Image.open(io.BytesIO(_image.png_of_cells(cells)))
+    assert image.mode == "L"
+    assert np.asarray(image).tolist() == [[1, 2, 3], [0, 100, 255]]
+
+
+def test_overlay_is_black_white_and_clear() -> None:
+    grid = OccupancyGrid(np.array([[0, 100, 255], [50, 0, 0]], np.uint8), 0.05)
+    image = Image.open(io.BytesIO(_image.overlay_png(grid))).convert("RGBA")
+    assert np.asarray(image).tolist() == [
+        [[128, 128, 128, 255], [255, 255, 255, 255], [255, 255, 255, 255]],
+        [[255, 255, 255, 255], [0, 0, 0, 255], [0, 0, 0, 0]],
+    ]
+
+
+def test_memory_of_writing_stays_near_the_output() -> None:
+    cells = np.zeros((4000, 4000), np.uint8)
+    cells.flags.writeable = False
+    tracemalloc.start()
+    try:
+        _image.png_of_cells(cells)
+        assert tracemalloc.get_traced_memory()[1] < cells.nbytes
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("make", [lambda d: d, bytes.lower])
+def test_kind_is_judged_by_content(make: Callable[[bytes], bytes]) -> None:
+    kinds = {name: _image.kind_of(data) for name, data in pictures().items()}
+    ends = {"png": "png", "pgm": "pgm", "ppm": "pgm", "pbm": "pgm", "bmp": "bmp", "jpg": "jpeg"}
+    assert all(kind == ends[name.rpartition(".")[2]] for name, kind in kinds.items())
+    assert _image.kind_of(make(b"Plain text")) is None
