@@ -1,0 +1,97 @@
+"""What a new version shall change, and what came out of preparing it."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
+
+from app.model.features import Features
+from app.model.frame import Datum, Level
+from app.model.layers import Part, PartKey
+from app.store.values import PartEntry, Provenance
+
+
+class Keep(enum.Enum):
+    """The sentinel for "leave it as it is"."""
+
+    KEEP = "keep"
+
+
+KEEP: Final = Keep.KEEP
+
+
+@dataclass(frozen=True, slots=True)
+class Replace:
+    """The part becomes this; what was under the key is gone."""
+
+    key: PartKey
+    part: Part
+    provenance: Provenance = Provenance()
+
+
+@dataclass(frozen=True, slots=True)
+class Put:
+    """Features are added or, where their id is known, replaced; members of the document are joined by key."""
+
+    key: PartKey
+    features: Features
+    provenance: Provenance = Provenance()
+
+
+@dataclass(frozen=True, slots=True)
+class Delete:
+    """Features go; NotFound where the part or an id is unknown."""
+
+    key: PartKey
+    ids: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Drop:
+    """The whole part goes; NotFound where there is none."""
+
+    key: PartKey
+
+
+Operation = Replace | Put | Delete | Drop
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """Operations in order, and the datum and levels where they are to change."""
+
+    operations: tuple[Operation, ...] = ()
+    datum: Datum | None | Literal[Keep.KEEP] = KEEP
+    levels: tuple[Level, ...] | Literal[Keep.KEEP] = KEEP
+
+
+@dataclass(frozen=True, slots=True)
+class IndexRows:
+    """Changes to the head's spatial index: ids to remove, and (id, box in degrees, WKB in degrees) to put."""
+
+    key: PartKey
+    removed: tuple[str, ...]
+    put: tuple[tuple[str, tuple[float, float, float, float], bytes], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A version ready to be committed on top of version ``base``; plain data, so it can cross processes.
+
+    chunks: hash (hex) -> stored bytes of all chunks that the base does not have. blobs: SHA-256 -> content of files
+    that belong to the content (resources). changes: counts by layer. changed: whether the root differs from the
+    base's. index: the index' changes where they are few, else None (it is brought up to date when it is asked).
+    """
+
+    base: int
+    root: str
+    chunks: Mapping[str, bytes]
+    parts: tuple[PartEntry, ...]
+    datum: Datum | None
+    levels: tuple[Level, ...]
+    changes: dict[str, Any]
+    changed: bool
+    blobs: Mapping[str, bytes] = field(default_factory=dict)
+    index: tuple[IndexRows, ...] | None = None

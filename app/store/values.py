@@ -1,0 +1,324 @@
+"""What the store hands out: frozen values, free of SQLAlchemy, picklable, all times aware and in UTC."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import Problem
+from app.model.features import Features
+from app.model.frame import Datum, Level
+from app.model.layers import LAYERS, Layer, PartKey
+
+Information = Literal["raw", "derived", "template", "generated"]
+State = Literal["queued", "running", "done", "failed", "cancelled"]
+Role = Literal["viewer", "robot", "editor", "admin"]
+
+Box = tuple[float, float, float, float]
+"""(minimum x, minimum y, maximum x, maximum y); in degrees (west, south, east, north), where west > east means that
+the box crosses the antimeridian."""
+
+Bounds = Mapping[Literal["local", "wgs84"], Box | None]
+"""The box of a part's local items in metres and of its wgs84 items in degrees; None where it has none of them."""
+
+INFORMATION_LAYERS: tuple[Layer, ...] = tuple(layer for layer in LAYERS if layer != "resources")
+"""The seven layers that a version tells about."""
+
+LATEST = "latest"
+"""The channel that moves by itself: the head."""
+
+
+@dataclass(frozen=True, slots=True)
+class Environment:
+    """A mapped place, as it is now.
+
+    id: stays when the name changes. head: the newest version's number, root: its root hash (hex). bounds: (west,
+    south, east, north) in degrees around all that it holds, or None where nothing is on earth. sequence: of its last
+    event. deleted: since when it waits for being restored or purged.
+    """
+
+    id: str
+    name: str
+    title: str
+    description: str
+    tags: tuple[str, ...]
+    head: int
+    root: str
+    datum: Datum | None
+    bounds: Box | None
+    created: datetime
+    updated: datetime
+    deleted: datetime | None
+    sequence: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """An uploaded file: its bytes are the blob ``sha256``. used: whether the version was made from it."""
+
+    name: str
+    size: int
+    sha256: str
+    format: str | None = None
+    used: bool = True
+
+    def as_dict(self) -> dict[str, Any]:
+        """The source in the contract's words."""
+        return {
+            "name": self.name,
+            "size": self.size,
+            "sha256": self.sha256,
+            "format": self.format,
+            "used": self.used,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Where a part's content comes from. It does not count for any hash.
+
+    information: it stands in a source, was computed from other layers, filled in, or made up. format: of the source.
+    sources: names of the version's sources that gave it. upload: SHA-256 over the uploaded files of this part. steps:
+    how it was computed, with parameters. attribution: licences and credits.
+    """
+
+    information: Information = "raw"
+    format: str | None = None
+    sources: tuple[str, ...] = ()
+    upload: str | None = None
+    steps: tuple[Mapping[str, Any], ...] = ()
+    attribution: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-like members, without the empty ones."""
+        members: dict[str, Any] = {
+            "information": self.information,
+            "format": self.format,
+            "sources": list(self.sources),
+            "upload": self.upload,
+            "steps": [dict(step) for step in self.steps],
+            "attribution": list(self.attribution),
+        }
+        return {name: value for name, value in members.items() if value}
+
+    @classmethod
+    def from_dict(cls, members: Mapping[str, Any]) -> Provenance:
+        """The reverse of ``as_dict``."""
+        return cls(
+            information=members.get("information", "raw"),
+            format=members.get("format"),
+            sources=tuple(members.get("sources", ())),
+            upload=members.get("upload"),
+            steps=tuple(members.get("steps", ())),
+            attribution=tuple(members.get("attribution", ())),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PartEntry:
+    """A version's line about one part.
+
+    hash: of the part's content (hex), the root of its tree. count: features, cells, voxels, pixels or files. bounds:
+    where its items lie. digest: hash of the canonical content in the order it was uploaded, empty after an edit; only
+    a short cut for "the same again".
+    """
+
+    key: PartKey
+    hash: str
+    count: int
+    bounds: Bounds
+    provenance: Provenance
+    digest: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Version:
+    """An immutable state of an environment.
+
+    environment: its name. changes: counts of what this version changed against its parent, by layer. warnings: what
+    was doubtful in its sources. parts: sorted by key.
+    """
+
+    environment: str
+    number: int
+    root: str
+    parent: int | None
+    author: str
+    message: str
+    time: datetime
+    changes: Mapping[str, Any]
+    sources: tuple[Source, ...]
+    warnings: tuple[Problem, ...]
+    datum: Datum | None
+    levels: tuple[Level, ...]
+    parts: tuple[PartEntry, ...]
+
+    def part(self, key: PartKey) -> PartEntry | None:
+        """The entry of a part, or None."""
+        return next((entry for entry in self.parts if entry.key == key), None)
+
+    @property
+    def information(self) -> dict[str, str]:
+        """For each of the seven layers raw, derived, template, generated, or missing; raw beats the others."""
+        order = ("raw", "derived", "generated", "template")
+        out: dict[str, str] = {}
+        for layer in INFORMATION_LAYERS:
+            kinds = {e.provenance.information for e in self.parts if e.key.layer == layer}
+            if layer == "location" and self.datum is not None and not kinds:
+                kinds = {"raw"}
+            out[layer] = next((kind for kind in order if kind in kinds), "missing")
+        return out
+
+    def as_dict(self) -> dict[str, Any]:
+        """The version in the contract's words."""
+        return {
+            "environment": self.environment,
+            "version": self.number,
+            "root": self.root,
+            "parent": self.parent,
+            "author": self.author,
+            "message": self.message,
+            "time": rfc3339(self.time),
+            "changes": dict(self.changes),
+            "sources": [source.as_dict() for source in self.sources],
+            "warnings": [warning.as_dict() for warning in self.warnings],
+            "information": self.information,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A channel's next move."""
+
+    version: int
+    activate_at: datetime
+    author: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A movable name for a version. version and root are None where the first move is still planned.
+
+    sequence: of the event that moved it last (``latest``: of the event that made the head).
+    """
+
+    name: str
+    version: int | None
+    root: str | None
+    sequence: int
+    planned: Planned | None
+    author: str
+    time: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One row of the log. sequence: of the environment, without gaps. body: the contract's event.
+
+    position: of the whole log, growing by one, so that one reader can follow all environments.
+    """
+
+    sequence: int
+    environment: str
+    body: Mapping[str, Any]
+    time: datetime
+    position: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Token:
+    """An access token without its secret. environments: a name pattern (fnmatch), None for all."""
+
+    id: str
+    name: str
+    role: Role
+    environments: str | None
+    robot: str | None
+    expires: datetime | None
+    created: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class Idempotency:
+    """A client's key for one request, and a fingerprint of the request's content."""
+
+    key: str
+    fingerprint: str
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Work that takes long. progress: 0 to 1. problem: why it failed, as an RFC 9457 object."""
+
+    id: str
+    state: State
+    progress: float
+    detail: str
+    result: Mapping[str, Any] | None
+    problem: Mapping[str, Any] | None
+    created: datetime
+    updated: datetime
+    owner: str
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureDelta:
+    """What turns a vector part of one version into that of another: a moved feature is one put."""
+
+    key: PartKey
+    put: Features
+    deleted: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rectangle:
+    """Changed cells: uint8 [height, width] with cells[0, 0] at (row, column), row 0 at the bottom."""
+
+    row: int
+    column: int
+    cells: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class GridDelta:
+    """What turns a grid of one version into that of another.
+
+    whole: the grid's frame (size, resolution, origin, mode) changed or the grid is new, so that only loading it helps;
+    rectangles is empty then. deleted: it is gone.
+    """
+
+    key: PartKey
+    rectangles: tuple[Rectangle, ...]
+    whole: bool = False
+    deleted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Delta:
+    """What changed in meaning between two versions. other: changed parts that are neither vectors nor grids."""
+
+    features: tuple[FeatureDelta, ...] = ()
+    grids: tuple[GridDelta, ...] = ()
+    other: tuple[PartKey, ...] = ()
+    datum: bool = False
+    levels: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A feature of some environment's head that stands in a box on earth: box in degrees."""
+
+    environment: str
+    key: PartKey
+    id: str
+    box: Box = field(default=(0.0, 0.0, 0.0, 0.0))
+
+
+def rfc3339(time: datetime) -> str:
+    """UTC with microseconds and a Z."""
+    return time.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
