@@ -24,7 +24,7 @@ from app.errors import BadUpload, FleetMapError, Invalid, NotFound, Problem, Too
 from app.model.features import Features
 from app.model.frame import GROUND, Anchor
 from app.model.geodesy import LocalFrame
-from app.model.layers import Layer, Layers
+from app.model.layers import Layer, Layers, PartKey
 
 Files = Mapping[str, bytes]
 """A map as named files: relative path with forward slashes -> content."""
@@ -54,7 +54,8 @@ class ReadContext:
 
     frame: the environment's, where it has a datum. level: where the map belongs. grid: the name for a grid, else None.
     layer: what the lines and polygons of a drawing are meant for, else None. options: the format's own read options.
-    wanted: the layers that will be used (None: all); a reader may leave others out. main: the file that was detected.
+    wanted: the layers that will be used (None: all); a reader may leave others out. cells: whether anybody will look at
+    the cells of grids; if not, a reader checks an image's header only. main: the file that was detected.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -64,6 +65,7 @@ class ReadContext:
     layer: Layer | None = None
     options: Any = None
     wanted: frozenset[Layer] | None = None
+    cells: bool = True
     main: str = ""
     warnings: list[Problem] = field(default_factory=list)
 
@@ -131,8 +133,10 @@ class Format:
     name: the contract's id. files: the names it is served as. media_types: of the served files, in that order.
     carries: layers it can hold. needs: what writing takes. detect: is this file (name, content) the main file of such
     a map; sure formats first (``rank``). companions: further files of the upload that belong to a main file.
-    family: format family of its objects (``osm``, ``kml`` …). rank: of two files that tell the same network, the
-    higher one wins. version: raise it when the same layers give other bytes (it is part of every ETag).
+    family: format family of its objects (``osm``, ``kml`` …). drawing: its lines and polygons may be meant for any layer
+    (the upload's ``layer`` says which). rank: of two files that tell the same network, the higher one wins. version:
+    raise it when the same layers give other bytes (it is part of every ETag). choose: of the parts that it carries,
+    those that these options ask for. outlines: it writes where grids lie, not their cells.
     """
 
     name: str
@@ -148,9 +152,12 @@ class Format:
     read_options: type[Any] = NoOptions
     write_options: type[Any] = NoOptions
     family: str = ""
+    drawing: bool = False
     rank: int = 0
     version: int = 1
     extensions: tuple[str, ...] = ()
+    choose: Callable[[Sequence[PartKey], Any], Sequence[PartKey]] = lambda keys, options: keys
+    outlines: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -84,8 +84,9 @@ class Layers:
 
     @property
     def layers(self) -> frozenset[Layer]:
-        """The layers that have content: a part without items is no information."""
-        return frozenset(key.layer for key, part in self.parts.items() if not is_empty(part))
+        """The layers that have content: a collection without items is no information, whatever its document says."""
+        full = {k.layer for k, p in self.parts.items() if not is_empty(p) and (len(p) if isinstance(p, Features) else 1)}
+        return frozenset(full | ({"location"} if self.datum else set()))
 
     def of(self, layer: Layer, level: str | None = None, name: str | None = None) -> dict[PartKey, Part]:
         """The parts of a layer, by key order."""

@@ -1,0 +1,421 @@
+"""A bundle of files -> layers: which file is which map, what a folder says, and which of two files is believed.
+
+Contract, section 8 "Uploads". Only files that tell the same thing compete: ``X`` wins over ``X_autogen``, and of two
+files that tell one network, the richer format wins; the others stay sources. Nothing read is thrown away.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import PurePosixPath
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app import formats
+from app.errors import BadUpload, Invalid, Problem, UnreadableFile
+from app.formats import Files, Group, Limits, ReadContext, _archive, _shell
+from app.model import network
+from app.model.features import Features, concatenate, from_columns, unique_ids
+from app.model.frame import GROUND, Datum, Level
+from app.model.geodesy import local_frame
+from app.model.layers import NETWORK, SITE, ZONES, Layer, Layers, Part, PartKey, Resources, is_empty, join_levels
+
+TEMPLATE_FOLDERS = ("location", "metric", "topological", "world")
+"""The folders of an environment_template's ``config``; the folder says what a drawing is meant for."""
+
+_FOLDER_LAYER: Mapping[str, Layer] = {"location": "location", "topological": "topology", "world": "objects"}
+
+DRAWN_LAYERS: tuple[Layer, ...] = ("objects", "topology", "location", "zones")
+
+_QUIET = re.compile(r"(^|/)(\.|license|licence|copying|readme|notice|authors|changelog)", re.IGNORECASE)
+_FENCE = re.compile(r"fence|boundary|perimeter", re.IGNORECASE)
+
+SAME_PLACE_DEGREES = 1e-7
+"""About a centimetre: two fences whose corners are nearer are one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hints:
+    """What the sender said of the files; everything else is found out from their content."""
+
+    format: str | None = None
+    layer: Layer | None = None
+    level: str = GROUND
+    grid: str | None = None
+    options: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What the environment knows already, and what will be used of the files (None: everything)."""
+
+    datum: Datum | None = None
+    fence: shapely.Polygon | None = None
+    wanted: frozenset[Layer] | None = None
+    cells: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Read:
+    """One part as one file told it."""
+
+    key: PartKey
+    part: Part
+    group: Group
+
+
+@dataclass(slots=True)
+class Use:
+    """What became of a file."""
+
+    format: str | None = None
+    used: bool = False
+
+
+@dataclass(slots=True)
+class Bundle:
+    """What the files say together: parts by key, each with the files and format it came from."""
+
+    parts: dict[PartKey, Part] = field(default_factory=dict)
+    origin: dict[PartKey, tuple[tuple[str, ...], str]] = field(default_factory=dict)
+    datum: Datum | None = None
+    levels: tuple[Level, ...] = ()
+    files: dict[str, Use] = field(default_factory=dict)
+    warnings: list[Problem] = field(default_factory=list)
+    fence: shapely.Polygon | None = None
+
+    def layers(self, datum: Datum | None) -> Layers:
+        """The parts under a datum (the bundle's own wins)."""
+        return Layers(dict(self.parts), self.datum or datum, join_levels((Level(),), self.levels))
+
+
+def unpack(files: Files, limits: Limits) -> dict[str, bytes]:
+    """The files, each ``.zip`` among them replaced by its members (a KMZ is a format, not a folder)."""
+    out: dict[str, bytes] = {}
+    for name, data in files.items():
+        members = {name: data}
+        if name.lower().endswith(".zip") and data[:2] == b"PK":
+            members = _archive.unpack(data, limits)
+        for member, content in members.items():
+            if member in out:
+                raise BadUpload(
+                    f"two files of the upload are called {member}: give them different names or folders",
+                    [Problem("this name is used twice", member)],
+                )
+            out[member] = content
+    if len(out) > limits.files:
+        raise BadUpload(f"the upload has {len(out)} files; the limit is {limits.files}")
+    return out
+
+
+def read(files: Files, hints: Hints, known: Known, limits: Limits) -> Bundle:
+    """All files of an upload (already unpacked) -> what they say together.
+
+    Raises BadUpload with every place that is wrong; Invalid for hints that cannot be used.
+    """
+    if hints.layer is not None and hints.layer not in DRAWN_LAYERS:
+        raise Invalid(f"layer must be one of {', '.join(DRAWN_LAYERS)}, got {hints.layer!r}")
+    if not files:
+        raise Invalid("the upload has no file: send at least one as form field 'files'")
+    bundle = Bundle(files={name: Use() for name in files})
+    variables = _read_variables(files, bundle)
+    groups, rest = _group({n: d for n, d in files.items() if n not in variables}, hints.format)
+    taken = _set_aside(groups, bundle)
+    _check_options(groups, hints)
+    found: list[Read] = []
+    problems: list[Problem] = []
+    details: list[str] = []
+    errors: list[type[BadUpload]] = []
+    for group in sorted(taken, key=lambda g: (-g.format.rank, g.main)):
+        try:
+            found += _read_group(group, hints, known, limits, bundle)
+        except BadUpload as error:
+            problems += error.problems
+            details.append(error.detail)
+            errors.append(type(error))
+    if errors:
+        raise errors[0](details[0] if len(details) == 1 else "; ".join(details), problems)
+    for name in rest:
+        if files[name] and not _QUIET.search(PurePosixPath(name).name):
+            bundle.warnings.append(Problem("no format reads this file: it is kept as a source", name))
+    _compete(found, bundle)
+    if hints.format is None and not any(u.format for u in bundle.files.values()) and not variables:
+        known_formats = ", ".join(f.name for f in formats.all_formats().values() if f.read)
+        detail = f"none of the files is a map that is known here; name the format, one of: {known_formats}"
+        raise UnreadableFile(detail, [Problem("no known map format", name) for name in sorted(files)])
+    _choose_datum(bundle, known)
+    return bundle
+
+
+def template_folder(name: str) -> tuple[str, ...] | None:
+    """The path below ``config`` of an environment_template (``("metric", "map", "map.yaml")``), else None."""
+    parts = PurePosixPath(name).parts
+    for start, part in enumerate(parts[:-2]):
+        if part == "config" and parts[start + 1] in TEMPLATE_FOLDERS:
+            return parts[start + 1 :]
+    return parts if len(parts) > 1 and parts[0] in TEMPLATE_FOLDERS else None
+
+
+def corner(parts: Mapping[PartKey, Part]) -> Datum | None:
+    """The south-west corner of what stands on earth: of ``<bounds>`` where a file has them, else of the data."""
+    stated = [b for p in parts.values() if isinstance(p, Features) and (b := p.document.get("bounds"))]
+    if stated:
+        boxes = np.array(stated, float)
+    else:
+        on_earth = [p.geometry[~p.local] for p in parts.values() if isinstance(p, Features) and p.needs_datum]
+        if not on_earth:
+            return None
+        boxes = shapely.bounds(np.concatenate(on_earth))
+        boxes = boxes[~np.isnan(boxes).any(axis=1)]
+        if not len(boxes):
+            return None
+    west, south, east = boxes[:, 0].min(), boxes[:, 1].min(), boxes[:, 2].max()
+    if east - west > 180.0:  # the data lies on both sides of the antimeridian: west is the smallest eastern longitude
+        west = boxes[boxes[:, 0] > 0.0, 0].min()
+    return Datum(float(np.clip(south, -85.0, 85.0)), float(west))
+
+
+def _group(files: Files, format_name: str | None) -> tuple[list[Group], list[str]]:
+    present = {name: data for name, data in files.items() if data}
+    if not present:
+        raise UnreadableFile("all files are empty", [Problem("the file is empty", name) for name in sorted(files)])
+    groups, rest = formats.group(present, format_name)
+    return groups, sorted({*rest, *(files.keys() - present.keys())})
+
+
+def _read_variables(files: Files, bundle: Bundle) -> set[str]:
+    """Literal assignments of ``properties.sh`` and ``environment.sh``; they are read and never run."""
+    variables: dict[str, str] = {}
+    names = sorted(n for n in files if PurePosixPath(n).name in ("properties.sh", "environment.sh") and files[n])
+    for name in names:
+        assigned, doubts = _shell.assignments(files[name])
+        variables.update(assigned)
+        bundle.files[name] = Use("environment", used=True)
+        bundle.warnings += [Problem(doubt, name) for doubt in doubts]
+    if names:
+        key = PartKey("objects", GROUND, "environment")
+        empty = from_columns([], np.empty(0, object), [], "local", {"environment": {"variables": variables}})
+        bundle.parts[key], bundle.origin[key] = empty, (tuple(names), "environment")
+    return set(names)
+
+
+def _set_aside(groups: list[Group], bundle: Bundle) -> list[Group]:
+    """Leave out what another file tells better, without reading it: ``X_autogen`` beside ``X``, a drawn network beside
+    a real one in ``topological/``, a drawn fence beside a datum in ``location/``."""
+    mains = {g.main: g for g in groups}
+    kinds = {(g.format.name, (template_folder(g.main) or ("",))[0]) for g in groups}
+    out = []
+    for group in groups:
+        name = group.main
+        reason = None
+        folder = (template_folder(name) or ("",))[0]
+        sibling = name.replace("_autogen", "", 1) if "_autogen" in PurePosixPath(name).name else None
+        if sibling in mains and mains[sibling].format is group.format:
+            reason = f"{sibling} is used instead of what was generated"
+        elif group.format.drawing and folder == "topological" and not _is_regions(name):
+            if ("tmap2", "topological") in kinds:
+                reason = "the network comes from the richer tmap2 file"
+        elif (
+            group.format.drawing
+            and folder == "location"
+            and re.match(r"fence[_.]", PurePosixPath(name).name)
+            and ("datum", "location") in kinds
+        ):
+            reason = "the fence comes from the datum file"
+        if reason is None:
+            out.append(group)
+            continue
+        for file in group.files:
+            bundle.files[file] = Use(group.format.name, used=False)
+        bundle.warnings.append(Problem(f"not used, kept as a source: {reason}", name))
+    return out
+
+
+def _known_options(group: Group, hints: Hints) -> dict[str, str]:
+    names = {f.name for f in dataclasses.fields(group.format.read_options)}
+    return {name: value for name, value in hints.options.items() if name in names}
+
+
+def _check_options(groups: list[Group], hints: Hints) -> None:
+    """An option that no format of the upload knows is refused, not ignored."""
+    known = {f.name for g in groups for f in dataclasses.fields(g.format.read_options)}
+    for name in hints.options:
+        if name not in known:
+            accepted = ", ".join(sorted(known)) or "none"
+            detail = f"no format of this upload has an option {name!r}; accepted options: {accepted}"
+            raise Invalid(detail, [Problem(f"unknown option; accepted: {accepted}", where=name)])
+
+
+def _is_regions(name: str) -> bool:
+    return "region" in PurePosixPath(name).name.lower()
+
+
+def _read_group(group: Group, hints: Hints, known: Known, limits: Limits, bundle: Bundle) -> list[Read]:
+    folder = template_folder(group.main)
+    layer = hints.layer
+    grid = hints.grid
+    if folder and layer is None and not (folder[0] == "topological" and _is_regions(group.main)):
+        layer = _FOLDER_LAYER.get(folder[0])
+    if folder and grid is None and folder[0] == "metric" and len(folder) > 2:
+        siblings = [n for n, u in bundle.files.items() if n.rpartition("/")[0] == group.main.rpartition("/")[0]]
+        yamls = sorted(n for n in siblings if n.endswith((".yaml", ".yml")) and "_autogen" not in n)
+        grid = folder[1] if group.main in yamls[:1] or not yamls else None
+    context = ReadContext(
+        limits=limits,
+        frame=None if known.datum is None else local_frame(known.datum),
+        level=hints.level,
+        grid=grid,
+        layer=layer,
+        options=formats.read_options(group.format, _known_options(group, hints)),
+        wanted=None if group.format.drawing else known.wanted,
+        cells=known.cells,
+    )
+    layers = formats.read(group, context)
+    for file in group.files:
+        bundle.files[file] = Use(group.format.name, used=True)
+    bundle.warnings += context.warnings
+    for site in layers.vector("location").values():
+        bundle.fence = bundle.fence or (site.geometry[0] if len(site) else None)
+    parts = dict(layers.parts)
+    if group.format.drawing and layer not in (None, "objects"):
+        parts = _assign(parts, layer, hints.level, known, layers.datum, group.main, bundle)
+    if layers.datum is not None:
+        if bundle.datum is None:
+            bundle.datum = layers.datum
+        elif bundle.datum != layers.datum:
+            bundle.warnings.append(Problem("its datum differs from the one that is used", group.main))
+    bundle.levels = join_levels(bundle.levels, [lv for lv in layers.levels if lv != Level()])
+    return [Read(key, part, group) for key, part in parts.items() if not is_empty(part)]
+
+
+def _assign(
+    parts: dict[PartKey, Part],
+    layer: Layer | None,
+    level: str,
+    known: Known,
+    datum: Datum | None,
+    file: str,
+    bundle: Bundle,
+) -> dict[PartKey, Part]:
+    """A drawing's lines and polygons as the layer they were drawn for."""
+    out = dict(parts)
+    for key, part in parts.items():
+        if key.layer != "objects" or not isinstance(part, Features) or not len(part):
+            continue
+        kinds = shapely.get_type_id(part.geometry)
+        lines = np.isin(kinds, [1, 2, 5])
+        areas = np.isin(kinds, [3, 6])
+        if layer == "topology":
+            frame = local_frame(datum or known.datum) if datum or known.datum else None
+            drawn = part if lines.any() else part.take(areas)
+            if not lines.any() and not areas.any():
+                bundle.warnings.append(Problem("it has no lines or polygons to make a network of", file))
+                continue
+            made = network.from_drawing(drawn, frame=frame, outlines=not lines.any())
+            out[PartKey("topology", level, NETWORK)] = made
+        elif layer == "zones":
+            _move(out, key, part, areas, PartKey("zones", level, ZONES), "keepout")
+        elif layer == "location":
+            fence = _own_fence(part, areas, known, bundle, file)
+            _move(out, key, part, fence, PartKey("location", level, SITE), "fence")
+    return out
+
+
+def _move(
+    parts: dict[PartKey, Part], key: PartKey, part: Features, which: NDArray[np.bool_], to: PartKey, kind: str
+) -> None:
+    """Take these features out of the objects and into another layer; the drawing's document goes along."""
+    if not which.any():
+        return
+    moved = part.take(which)
+    generic = {"region", "path", "poi", None}
+    properties = tuple({**p, "kind": kind} if p.get("kind") in generic else p for p in moved.properties)
+    parts[to] = Features(moved.ids, moved.geometry, properties, moved.local, part.document)
+    parts[key] = part.take(~which)
+
+
+def _own_fence(part: Features, areas: NDArray[np.bool_], known: Known, bundle: Bundle, file: str) -> NDArray[np.bool_]:
+    """Which of the polygons is the environment's own fence: a mask with at most one True."""
+    where = np.flatnonzero(areas & ~part.local)
+    chosen = np.zeros(len(part), bool)
+    fence = bundle.fence or known.fence
+    if fence is not None:
+        same = [k for k in where if shapely.hausdorff_distance(part.geometry[k], fence) < SAME_PLACE_DEGREES]
+        chosen[same[:1]] = True
+        return chosen
+    named = [k for k in where if _FENCE.search(str(part.properties[k].get("name") or ""))]
+    if len(where) == 1 or len(named) == 1:
+        chosen[where if len(where) == 1 else named] = True
+    elif len(where):
+        bundle.warnings.append(
+            Problem("none of its polygons is called fence, so all are kept as regions and no GNSS fence is set", file)
+        )
+    return chosen
+
+
+def _compete(found: list[Read], bundle: Bundle) -> None:
+    """Join what belongs together; where two files tell the same network, site or grid, believe one of them."""
+    by_key: dict[PartKey, list[Read]] = {}
+    for one in found:
+        by_key.setdefault(one.key, []).append(one)
+    useful: set[str] = set()
+    for key, rivals in sorted(by_key.items()):
+        winners = rivals
+        if key.layer in ("topology", "location", "occupancy", "voxels", "imagery") and len(rivals) > 1:
+            rivals.sort(key=_trust)
+            winners = rivals[:1]
+            for loser in rivals[1:]:
+                what = {"topology": "network", "location": "location", "occupancy": f"grid {key.name}"}.get(key.layer)
+                reason = f"its {what or key.layer} is not used: {winners[0].group.main} tells it"
+                bundle.warnings.append(Problem(reason, loser.group.main))
+        useful.update(w.group.main for w in winners)
+        bundle.parts[key] = _join(key, [w.part for w in winners])
+        names = tuple(sorted({n for w in winners for n in w.group.files}))
+        bundle.origin[key] = (names, winners[0].group.format.name)
+    for one in found:
+        if one.group.main not in useful:
+            for name in one.group.files:
+                bundle.files[name].used = False
+
+
+def _trust(one: Read) -> tuple[object, ...]:
+    name = PurePosixPath(one.group.main).name
+    return (-one.group.format.rank, name.startswith("."), "_autogen" in name, len(name), one.group.main)
+
+
+def _join(key: PartKey, parts: list[Part]) -> Part:
+    if len(parts) == 1:
+        return parts[0]
+    if key.layer == "resources":
+        files: dict[str, bytes] = {}
+        for part in parts:
+            files.update(part.files if isinstance(part, Resources) else {})
+        return Resources(files)
+    collections = [p for p in parts if isinstance(p, Features)]
+    taken: set[str] = set()
+    renamed = []
+    for c in collections:
+        ids = unique_ids(c.ids, taken)
+        taken.update(ids)
+        renamed.append(
+            c if tuple(ids) == c.ids else Features(tuple(ids), c.geometry, c.properties, c.local, c.document)
+        )
+    return concatenate(renamed)
+
+
+def _choose_datum(bundle: Bundle, known: Known) -> None:
+    if bundle.datum is not None or known.datum is not None:
+        return
+    chosen = corner(bundle.parts)
+    if chosen is not None:
+        bundle.datum = chosen
+        reason = (
+            f"the environment has no datum: the south-west corner, latitude {chosen.latitude!r}, longitude "
+            f"{chosen.longitude!r}, is taken; upload a datum.yaml or PATCH the environment to set another"
+        )
+        bundle.warnings.append(Problem(reason))

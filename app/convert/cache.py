@@ -1,0 +1,166 @@
+"""Made maps on disk, keyed by content: one of many askers makes a map, all others wait for it.
+
+A map is a folder ``<key[:2]>/<key>`` with its files and ``map.json``; it appears by a rename, so it is whole or absent.
+A file lock for each key holds across worker processes of the server.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import logging
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import orjson
+
+log = logging.getLogger(__name__)
+
+FRESH_SECONDS = 60.0
+"""A map is marked as used at most this often: its age decides what goes when room is needed."""
+
+
+@dataclass(frozen=True, slots=True)
+class MadeFile:
+    """One file of a made map, on disk."""
+
+    name: str
+    size: int
+    sha256: str
+    media_type: str
+    path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A made map: its files (main file first), the one thing to download, and the report."""
+
+    files: tuple[MadeFile, ...]
+    archive: MadeFile | None
+    report: dict[str, Any]
+
+    def whole(self) -> MadeFile:
+        """The file itself where the map is one file, else the zip of all."""
+        return self.archive or self.files[0]
+
+    def file(self, name: str) -> MadeFile | None:
+        """One file by its name."""
+        return next((f for f in self.files if f.name == name), None)
+
+
+@dataclass(frozen=True, slots=True)
+class Product:
+    """What a maker returns: content by name with media types, an archive of it where there are several, the report."""
+
+    files: dict[str, tuple[bytes, str]]
+    archive: tuple[str, bytes] | None
+    report: dict[str, Any]
+
+
+class Cache:
+    """At most ``limit`` bytes of made maps; the longest unused go first."""
+
+    def __init__(self, folder: Path, limit: int) -> None:
+        self._folder, self._limit = folder, limit
+        self._known: dict[str, Made] = {}
+        self._locks: dict[str, threading.Lock] = {}
+        self._guard = threading.Lock()
+        self.hits = self.misses = 0
+        (folder / "locks").mkdir(parents=True, exist_ok=True)
+        for old in folder.glob("making-*"):  # left by a killed process
+            shutil.rmtree(old, ignore_errors=True)
+
+    def get(self, key: str) -> Made | None:
+        """The map, if it is made."""
+        folder = self._path(key)
+        try:
+            described = orjson.loads((folder / "map.json").read_bytes())
+            if time.time() - folder.stat().st_mtime > FRESH_SECONDS:
+                os.utime(folder)
+        except (OSError, orjson.JSONDecodeError):
+            return None
+        files = tuple(_described(folder, f) for f in described["files"])
+        archive = _described(folder, described["archive"]) if described["archive"] else None
+        return Made(files, archive, described["report"])
+
+    def get_or_make(self, key: str, maker: Callable[[], Product]) -> Made:
+        """The map; made now if nobody has, and then by one caller only."""
+        found = self.get(key)
+        if found is not None:
+            self.hits += 1
+            return found
+        with self._only(key):
+            found = self.get(key)
+            if found is not None:
+                self.hits += 1
+                return found
+            self.misses += 1
+            return self._store(key, maker())
+
+    def _store(self, key: str, product: Product) -> Made:
+        making = self._folder / f"making-{uuid4().hex}"
+        making.mkdir()
+        try:
+            files = [_write(making, str(k), name, *content) for k, (name, content) in enumerate(product.files.items())]
+            archive = _write(making, "whole", *product.archive, "application/zip") if product.archive else None
+            described = {"files": files, "archive": archive, "report": product.report}
+            (making / "map.json").write_bytes(orjson.dumps(described))
+            target = self._path(key)
+            target.parent.mkdir(exist_ok=True)
+            with contextlib.suppress(OSError):  # another host on the same disk may have been first: equal bytes
+                making.rename(target)
+        finally:
+            shutil.rmtree(making, ignore_errors=True)
+        self._make_room()
+        made = self.get(key)
+        if made is None:
+            raise OSError(f"the cache folder {self._folder} does not keep what is written to it")
+        return made
+
+    def _make_room(self) -> None:
+        entries = []
+        for folder in self._folder.glob("[0-9a-f][0-9a-f]/*"):
+            with contextlib.suppress(OSError):
+                size = sum(f.stat().st_size for f in folder.iterdir())
+                entries.append((folder.stat().st_mtime, size, folder))
+        total = sum(size for _, size, _ in entries)
+        for _, size, folder in sorted(entries)[:-1]:  # the newest stays, whatever its size
+            if total <= self._limit:
+                break
+            shutil.rmtree(folder, ignore_errors=True)
+            total -= size
+
+    @contextlib.contextmanager
+    def _only(self, key: str) -> Iterator[None]:
+        """One caller at a time for a key, among threads and processes."""
+        with self._guard:
+            lock = self._locks.setdefault(key, threading.Lock())
+        with lock:
+            path = self._folder / "locks" / key[:2]  # few files; neighbours in the hash wait for each other, rarely
+            with path.open("w") as handle:
+                fcntl.flock(handle, fcntl.LOCK_EX)
+                yield
+        with self._guard:
+            if not lock.locked():
+                self._locks.pop(key, None)
+
+    def _path(self, key: str) -> Path:
+        return self._folder / key[:2] / key
+
+
+def _write(folder: Path, stored: str, name: str, data: bytes, media_type: str) -> dict[str, Any]:
+    (folder / stored).write_bytes(data)
+    digest = hashlib.sha256(data).hexdigest()
+    return {"name": name, "stored": stored, "size": len(data), "sha256": digest, "media_type": media_type}
+
+
+def _described(folder: Path, f: dict[str, Any]) -> MadeFile:
+    return MadeFile(f["name"], f["size"], f["sha256"], f["media_type"], folder / f["stored"])

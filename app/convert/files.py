@@ -1,0 +1,89 @@
+"""Files -> files, without a server or a store: ``fleetmap convert`` and ``POST /convert``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from app import bundle, formats
+from app.bundle import Hints, Known
+from app.convert import make as making
+from app.convert import recipe as recipes
+from app.errors import MissingLayer, Problem
+from app.formats import Files, Limits
+from app.model.frame import Datum
+from app.model.layers import Features, Layers, PartKey
+
+
+@dataclass(frozen=True, slots=True)
+class Converted:
+    """The map's files, main file first, the report on it, and what was doubtful in the input."""
+
+    files: dict[str, bytes]
+    report: dict[str, Any]
+    warnings: list[Problem] = field(default_factory=list)
+
+
+def offline(
+    files: Files,
+    to: str,
+    *,
+    hints: Hints | None = None,
+    datum: Datum | None = None,
+    options: Mapping[str, str] | None = None,
+    derived: bool = True,
+    limits: Limits | None = None,
+) -> Converted:
+    """Read files, derive what the wanted format lacks, write it. ``options`` are the wanted format's own.
+
+    Raises what reading and planning raise; see ``app.bundle.read`` and ``app.convert.recipe.chain``.
+    """
+    known = formats.get_format(to)
+    write_options = formats.write_options(known, options or {})
+    limits = limits or Limits()
+    unpacked = bundle.unpack(files, limits)
+    hints = hints or Hints()
+    carried = None if "objects" in known.carries else known.carries
+    told = bundle.read(unpacked, hints, Known(datum, None, carried, not known.outlines), limits)
+    layers = told.layers(datum)
+    try:
+        way = recipes.chain(known, _stock(layers), write_options, derived=derived)
+    except MissingLayer:
+        if carried is None:
+            raise
+        # What the format carries is not in the files: read all they have, to derive it from.
+        told = bundle.read(unpacked, hints, Known(datum, None, None, not known.outlines), limits)
+        layers = told.layers(datum)
+        way = recipes.chain(known, _stock(layers), write_options, derived=derived)
+    kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
+    written = making.write(known, kept, options or {}, way, origin=told.origin)
+    report = {**written.report, "warnings": [p.as_dict() for p in told.warnings] + written.report["warnings"]}
+    return Converted(written.files, report, told.warnings)
+
+
+def offline_paths(
+    paths: Mapping[str, Path],
+    to: str,
+    hints: Hints,
+    datum: Datum | None,
+    options: Mapping[str, str],
+    limits: Limits,
+) -> Converted:
+    """The same from spooled files: what a worker process is asked to do."""
+    files = {name: path.read_bytes() for name, path in paths.items()}
+    return offline(files, to, hints=hints, datum=datum, options=options, limits=limits)
+
+
+def _stock(layers: Layers) -> recipes.Stock:
+    keys: set[PartKey] = set()
+    anchors: dict[PartKey, frozenset[str]] = {}
+    for key, part in layers.parts.items():
+        if isinstance(part, Features):
+            if not len(part):
+                continue
+            some = {"local"} if part.local.any() else set()
+            anchors[key] = frozenset(some | ({"wgs84"} if part.needs_datum else set()))
+        keys.add(key)
+    return recipes.Stock(frozenset(keys), layers.datum is not None, anchors)

@@ -1,0 +1,132 @@
+"""Carry out a recipe: load the parts, derive what is missing, write the format, and tell what was lost or made up."""
+
+from __future__ import annotations
+
+import mimetypes
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from app import derive, formats
+from app.convert.recipe import Chain
+from app.errors import Problem
+from app.formats import Format, WriteContext, _archive
+from app.model.layers import LAYERS, Features, Layers, PartKey
+from app.store import Store
+from app.store.values import PartEntry, Version
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """A map: its files, main file first, and the report on it."""
+
+    files: dict[str, bytes]
+    report: dict[str, Any]
+
+
+@lru_cache(maxsize=4)
+def open_store(database_url: str, blob_dir: str) -> Store:
+    """A worker's own view of the store, kept between jobs."""
+    return Store(database_url, Path(blob_dir), readonly=True)
+
+
+def make(
+    database_url: str, blob_dir: str, version: Version, name: str, values: Mapping[str, Any], way: Chain
+) -> Written:
+    """In a worker: a stored version's map. The parts are addressed by content, so no later change can mix in."""
+    store = open_store(database_url, blob_dir)
+    known = formats.get_format(name)
+    loaded = store.load(version, way.keys)
+    layers = Layers(loaded.parts, version.datum, version.levels)
+    entries = {e.key: e for e in version.parts}
+    return write(known, layers, values, way, entries)
+
+
+def write(
+    known: Format,
+    layers: Layers,
+    values: Mapping[str, Any],
+    way: Chain,
+    entries: Mapping[PartKey, PartEntry] | None = None,
+    origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None = None,
+) -> Written:
+    """Derive and write. ``entries`` (of a stored version) or ``origin`` (of files) say where each part came from."""
+    made = derive.run(way.steps, layers)
+    used = Layers({k: p for k, p in made.parts.items() if k.layer in known.carries}, made.datum, made.levels)
+    context = WriteContext(options=formats.write_options(known, values))
+    files = formats.write(known, used, context)
+    report = {
+        "format": known.name,
+        "layers": _told(used, layers, way, entries or {}, origin or {}),
+        "template": context.template,
+        "dropped": context.dropped + _not_carried(known, entries, layers),
+        "warnings": [p.as_dict() for p in context.warnings],
+    }
+    return Written(files, report)
+
+
+def media_type(known: Format, name: str) -> str:
+    """The media type of one of a format's files, by its ending."""
+    end = name.rpartition(".")[2]
+    for pattern, declared in zip(known.files, known.media_types, strict=False):
+        if pattern.rpartition(".")[2] == end:
+            return declared
+    return mimetypes.guess_type(name)[0] or "application/octet-stream"
+
+
+def zipped(files: Mapping[str, bytes]) -> bytes:
+    """Several files as one archive, the same bytes each time."""
+    return _archive.pack(files)
+
+
+def _told(
+    used: Layers,
+    before: Layers,
+    way: Chain,
+    entries: Mapping[PartKey, PartEntry],
+    origin: Mapping[PartKey, tuple[tuple[str, ...], str]],
+) -> list[dict[str, Any]]:
+    """For each part in the map: raw, derived or template, by which steps, from which sources."""
+    out = []
+    steps = {step.gives: step for step in way.steps}
+    for key in sorted(used.parts):
+        part = used.parts[key]
+        if isinstance(part, Features) and not len(part):
+            continue
+        line: dict[str, Any] = {"layer": key.layer, "level": key.level, "name": key.name}
+        if key not in before.parts and key.layer in steps:
+            step = steps[key.layer]
+            sources = sorted({s for k, e in entries.items() if k.layer in step.needs for s in e.provenance.sources})
+            sources = sources or sorted({s for k, (n, _) in origin.items() if k.layer in step.needs for s in n})
+            line |= {"information": "derived", "steps": [step.name], "sources": sources}
+        elif key in entries:
+            p = entries[key].provenance
+            line |= {"information": p.information, "steps": [dict(s) for s in p.steps], "sources": list(p.sources)}
+        else:
+            line |= {"information": "raw", "steps": [], "sources": list(origin.get(key, ((), ""))[0])}
+        out.append(line)
+    if used.datum is not None and not any(line["layer"] == "location" for line in out):
+        out.insert(0, {"layer": "location", "information": "raw", "steps": [], "sources": [], "name": "datum"})
+    return out
+
+
+def _not_carried(known: Format, entries: Mapping[PartKey, PartEntry] | None, layers: Layers) -> list[dict[str, Any]]:
+    """Stored layers that this format has no words for."""
+    counts: dict[str, int] = {}
+    if entries is not None:
+        for key, entry in entries.items():
+            if key.layer not in known.carries and entry.count:
+                counts[key.layer] = counts.get(key.layer, 0) + entry.count
+    else:
+        for key, part in layers.parts.items():
+            if key.layer not in known.carries:
+                counts[key.layer] = counts.get(key.layer, 0) + (len(part) if isinstance(part, Features) else 1)
+    why = f"{known.name} has no place for it"
+    return [{"what": layer, "count": counts[layer], "why": why} for layer in LAYERS if counts.get(layer)]
+
+
+def warnings_of(report: Mapping[str, Any]) -> list[Problem]:
+    """A report's warnings as values."""
+    return [Problem(w["problem"], w.get("file"), w.get("line"), w.get("where")) for w in report["warnings"]]

@@ -1,0 +1,120 @@
+"""The service that gives maps: plans, makes, caches, reports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from app import formats, parameters
+from app.bundle import Hints
+from app.convert import files as direct
+from app.convert import make as making
+from app.convert import recipe as recipes
+from app.convert.cache import Cache, Made, Product
+from app.convert.recipe import Recipe
+from app.errors import CannotConvert, FleetMapError, UnreadableFile
+from app.formats import Limits
+from app.model.frame import Datum
+from app.pool import WorkerDied
+from app.store import Store
+from app.store.values import Version
+
+Run = Callable[..., Any]
+"""``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""
+
+
+class Maps:
+    """Maps of stored versions, made on demand in worker processes and kept by content."""
+
+    def __init__(
+        self, store: Store, run: Run, cache_dir: Path, limits: Limits, *, cache_bytes: int = 4 * 2**30
+    ) -> None:
+        self._store, self._run, self._limits = store, run, limits
+        self.cache = Cache(cache_dir, cache_bytes)
+
+    def recipe(
+        self, version: Version, name: str, values: Mapping[str, str] | None = None, *, derive: bool = True
+    ) -> Recipe:
+        """How the map would be made; cheap. Raises NotFound, Invalid, MissingLayer, MissingDatum, Ambiguous."""
+        return recipes.recipe(version, name, values or {}, derived=derive)
+
+    def ready(self, recipe: Recipe) -> Made | None:
+        """The map, only if it is made already."""
+        return self.cache.get(recipe.key)
+
+    def make(self, recipe: Recipe) -> Made:
+        """The map; blocks until it is made."""
+        return self.cache.get_or_make(recipe.key, lambda: self._made(recipe))
+
+    def report(self, recipe: Recipe) -> dict[str, Any]:
+        """What was raw, derived, filled in and dropped: the contract's report, for this version."""
+        told = self.make(recipe).report
+        entries = {(e.key.layer, e.key.level, e.key.name): e.provenance for e in recipe.version.parts}
+        lines = []
+        for line in told["layers"]:
+            # Equal content may have come from other files in another version: sources are this version's own.
+            known = entries.get((line["layer"], line.get("level"), line["name"]))
+            if known is not None:
+                line = {**line, "information": known.information, "sources": list(known.sources)}  # noqa: PLW2901
+            lines.append(line)
+        return {**told, "version": recipe.version.number, "layers": lines}
+
+    def coverage(self, version: Version) -> list[dict[str, Any]]:
+        """For every format that can be served: direct, derivable or missing, by which chain, and what to supply."""
+        available = recipes.stock(version)
+        out = []
+        for known in formats.all_formats().values():
+            if known.write is None:
+                continue
+            line: dict[str, Any] = {"format": known.name, "state": "missing", "chain": [], "missing": []}
+            try:
+                way = recipes.chain(known, available, known.write_options())
+            except FleetMapError as error:
+                line["missing"] = recipes.missing(known, available) or [error.detail]
+            else:
+                line["state"] = "derivable" if way.steps else "direct"
+                line["chain"] = [_step(step) for step in way.steps]
+            out.append(line)
+        return out
+
+    def convert(
+        self,
+        files: Mapping[str, Path],
+        to: str,
+        *,
+        hints: Hints | None = None,
+        datum: Datum | None = None,
+        options: Mapping[str, str] | None = None,
+    ) -> direct.Converted:
+        """Convert spooled files without storing anything."""
+        formats.write_options(formats.get_format(to), options or {})
+        arguments = (dict(files), to, hints or Hints(), datum, dict(options or {}), self._limits)
+        try:
+            converted: direct.Converted = self._run(direct.offline_paths, *arguments)
+        except WorkerDied as error:
+            raise UnreadableFile(f"the files could not be converted: {error.detail}") from error
+        return converted
+
+    def _made(self, recipe: Recipe) -> Product:
+        values = parameters.canonical(recipe.options)
+        where = (self._store.database_url, str(self._store.blob_dir))
+        try:
+            written: making.Written = self._run(
+                making.make, *where, recipe.version, recipe.format.name, values, recipe.chain
+            )
+        except WorkerDied as error:
+            raise CannotConvert(f"{recipe.format.name} could not be made: {error.detail}") from error
+        typed = {name: (data, making.media_type(recipe.format, name)) for name, data in written.files.items()}
+        archive = None
+        if len(typed) > 1:
+            archive = (f"{recipe.format.name}.zip", making.zipped(written.files))
+        return Product(typed, archive, written.report)
+
+
+def _step(step: Any) -> dict[str, Any]:
+    from app.derive import all_derivations
+
+    known = all_derivations()[step.name]
+    values = {p["name"]: p["default"] for p in parameters.describe(known.parameters)}
+    return {"step": step.name, "from": list(step.needs), "to": step.gives, "parameters": values}

@@ -1,0 +1,8 @@
+"""WRITE: bytes or edits -> layers -> one version, with its event, in one transaction; or nothing.
+
+``prepare`` runs in a worker process (it reads hostile bytes and computes); ``service`` commits what it found.
+"""
+
+from app.ingest.service import Ingest, Outcome, SpooledFile, Upload
+
+__all__ = ["Ingest", "Outcome", "SpooledFile", "Upload"]

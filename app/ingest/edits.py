@@ -1,0 +1,341 @@
+"""The contract's edits (put, delete, cells) -> changes of the store, checked against the version they build on."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import shapely
+import shapely.geometry
+
+from app.errors import Invalid, MissingDatum, NotFound, Problem
+from app.model.features import NO_GEOMETRY, Features, Properties
+from app.model.frame import GROUND
+from app.model.geodesy import LocalFrame, local_frame
+from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import NETWORK, SITE, VECTOR_LAYERS, ZONES, Layer, PartKey
+from app.store import Store
+from app.store.changes import Changes, Delete, Provenance, Put, Replace
+from app.store.values import Version
+
+EDITED = Provenance("raw", "edit")
+
+_USUAL_NAME: Mapping[str, str] = {"topology": NETWORK, "location": SITE, "zones": ZONES, "objects": "edit"}
+
+
+@dataclass(slots=True)
+class _Draft:
+    """One vector part while it is edited: what is put and deleted, over what is stored."""
+
+    stored: Features | None
+    puts: dict[str, tuple[Any, Properties, bool]] = field(default_factory=dict)
+    deletes: set[str] = field(default_factory=set)
+
+    def holds(self, item: str) -> bool:
+        if item in self.puts:
+            return True
+        return item not in self.deletes and self.stored is not None and item in set(self.stored.ids)
+
+    def row(self, item: str) -> tuple[Any, Properties, bool]:
+        if item in self.puts:
+            return self.puts[item]
+        assert self.stored is not None
+        k = self.stored.ids.index(item)
+        return self.stored.geometry[k], self.stored.properties[k], bool(self.stored.local[k])
+
+
+def edit_changes(
+    store: Store, base: Version, changes: Sequence[Mapping[str, Any]]
+) -> tuple[Changes, tuple[Problem, ...]]:
+    """All edits together as one change. Raises Invalid with the place of every edit that cannot be made."""
+    if not changes:
+        raise Invalid("there is nothing to change: give at least one of put, delete or cells in 'changes'")
+    session = _Session(store, base)
+    problems: list[Problem] = []
+    for k, change in enumerate(changes):
+        try:
+            session.apply(change)
+        except (Invalid, NotFound, MissingDatum) as error:
+            problems.append(Problem(error.detail, where=f"changes[{k}]"))
+    problems += session.dangling()
+    if problems:
+        raise Invalid("; ".join(p.problem for p in problems), problems)
+    return session.changes(), ()
+
+
+class _Session:
+    def __init__(self, store: Store, base: Version) -> None:
+        self._store, self._base = store, base
+        self._frame: LocalFrame | None = None if base.datum is None else local_frame(base.datum)
+        self._drafts: dict[PartKey, _Draft] = {}
+        self._grids: dict[PartKey, OccupancyGrid] = {}
+        self._keys = {e.key for e in base.parts}
+
+    def apply(self, change: Mapping[str, Any]) -> None:
+        """One edit of the contract: op put, delete or cells."""
+        operation = change.get("op")
+        known = {
+            "put": {"op", "layer", "level", "name", "feature", "crs"},
+            "delete": {"op", "layer", "level", "name", "id"},
+            "cells": {"op", "grid", "level", "polygon", "crs", "value"},
+        }
+        if operation not in known:
+            raise Invalid(f"op must be put, delete or cells, got {operation!r}")
+        extra = set(change) - known[operation]
+        if extra:
+            raise Invalid(f"{operation} has no member {sorted(extra)[0]!r}")
+        {"put": self._put, "delete": self._delete, "cells": self._cells}[operation](change)
+
+    def dangling(self) -> list[Problem]:
+        """Edges that would start or end at a node that is not there."""
+        out = []
+        for key, draft in self._drafts.items():
+            if key.layer != "topology":
+                continue
+            rows: dict[str, Properties] = {}
+            if draft.stored is not None:
+                rows.update(zip(draft.stored.ids, draft.stored.properties, strict=True))
+            rows = {i: p for i, p in rows.items() if i not in draft.deletes}
+            rows.update({i: p for i, (_, p, _) in draft.puts.items()})
+            nodes = {i for i, p in rows.items() if p.get("kind") == "node"}
+            for item, p in rows.items():
+                if p.get("kind") != "edge":
+                    continue
+                for end in ("source", "target"):
+                    if p.get(end) not in nodes:
+                        reason = (
+                            f"edge {item} has {end} {p.get(end)!r}, which is no node: put the node, or delete the edge"
+                        )
+                        out.append(Problem(reason, where=item))
+        return out
+
+    def changes(self) -> Changes:
+        """What the store is asked to do."""
+        operations: list[Put | Delete | Replace] = []
+        for key, draft in sorted(self._drafts.items()):
+            if draft.deletes:
+                operations.append(Delete(key, tuple(sorted(draft.deletes))))
+            if draft.puts:
+                ids = tuple(draft.puts)
+                geometry = np.empty(len(ids), object)
+                geometry[:] = [draft.puts[i][0] for i in ids]
+                properties = tuple(draft.puts[i][1] for i in ids)
+                local = np.array([draft.puts[i][2] for i in ids], bool)
+                operations.append(Put(key, Features(ids, geometry, properties, local), self._provenance(key)))
+        for key, grid in sorted(self._grids.items()):
+            operations.append(Replace(key, grid, self._provenance(key)))
+        return Changes(tuple(operations))
+
+    def _provenance(self, key: PartKey) -> Provenance:
+        """An edited part stays what it was made of: raw, derived …"""
+        return next((e.provenance for e in self._base.parts if e.key == key), EDITED)
+
+    def _draft(self, key: PartKey) -> _Draft:
+        if key not in self._drafts:
+            stored = self._store.load(self._base, [key]).parts.get(key) if key in self._keys else None
+            self._drafts[key] = _Draft(stored if isinstance(stored, Features) else None)
+        return self._drafts[key]
+
+    def _layer(self, change: Mapping[str, Any]) -> Layer:
+        layer = change.get("layer")
+        if layer not in VECTOR_LAYERS:
+            raise Invalid(f"layer must be one of {', '.join(sorted(VECTOR_LAYERS))}, got {layer!r}")
+        return layer
+
+    def _put(self, change: Mapping[str, Any]) -> None:
+        layer, feature = self._layer(change), change.get("feature")
+        if not isinstance(feature, Mapping) or feature.get("type") != "Feature":
+            raise Invalid("put needs 'feature', a GeoJSON Feature")
+        item = feature.get("id")
+        if not isinstance(item, str) or not item:
+            raise Invalid("the feature needs an 'id', a text")
+        properties = feature.get("properties") or {}
+        if not isinstance(properties, Mapping):
+            raise Invalid("the feature's 'properties' must be an object")
+        key = self._key_of(layer, item, change)
+        draft = self._draft(key)
+        geometry, local = self._geometry(feature, change)
+        if layer == "topology":
+            properties = _network_item(item, properties)
+            if geometry is None and properties["kind"] == "edge":
+                geometry, local = self._straight(draft, properties)
+        if geometry is None:
+            geometry = NO_GEOMETRY
+        before = draft.row(item) if draft.holds(item) else None
+        draft.deletes.discard(item)
+        draft.puts[item] = (geometry, dict(properties), local)
+        if layer == "topology" and properties["kind"] == "node" and before is not None:
+            self._drag_edges(draft, item, before, (geometry, local))
+
+    def _straight(self, draft: _Draft, properties: Mapping[str, Any]) -> tuple[Any, bool]:
+        """An edge without a geometry runs straight from node to node."""
+        ends = []
+        for end in ("source", "target"):
+            if not draft.holds(properties[end]):
+                return NO_GEOMETRY, True  # told as dangling when all edits are known
+            ends.append(draft.row(properties[end]))
+        local = ends[0][2]
+        places = [g if there == local else self._other(g, there) for g, _, there in ends]
+        return shapely.LineString([shapely.get_coordinates(p, include_z=p.has_z)[0][:2] for p in places]), local
+
+    def _other(self, geometry: Any, local: bool) -> Any:
+        if self._frame is None:
+            raise MissingDatum("the environment has no datum, so local metres and places on earth cannot be joined")
+        one = np.array([geometry], object)
+        return (self._frame.geometries_to_wgs84(one) if local else self._frame.geometries_to_local(one))[0]
+
+    def _drag_edges(
+        self, draft: _Draft, node: str, before: tuple[Any, Properties, bool], now: tuple[Any, bool]
+    ) -> None:
+        """Edges that ended at a node's old place end at its new one, unless this change puts them itself."""
+        if draft.stored is None or before[0].equals_exact(now[0], 0.0):
+            return
+        for k, properties in enumerate(draft.stored.properties):
+            item = draft.stored.ids[k]
+            if properties.get("kind") != "edge" or item in draft.puts or item in draft.deletes:
+                continue
+            if node not in (properties.get("source"), properties.get("target")):
+                continue
+            local = bool(draft.stored.local[k])
+            place = now[0] if now[1] == local else self._other(now[0], now[1])
+            line = draft.stored.geometry[k]
+            if line.geom_type != "LineString":
+                continue
+            vertices = shapely.get_coordinates(line, include_z=line.has_z)
+            target = shapely.get_coordinates(place, include_z=bool(line.has_z))[0]
+            target = np.nan_to_num(target, nan=0.0)
+            if properties.get("source") == node:
+                vertices[0] = target
+            if properties.get("target") == node:
+                vertices[-1] = target
+            draft.puts[item] = (shapely.LineString(vertices), properties, local)
+
+    def _delete(self, change: Mapping[str, Any]) -> None:
+        layer, item = self._layer(change), change.get("id")
+        if not isinstance(item, str) or not item:
+            raise Invalid("delete needs 'id', the id of a feature")
+        key = self._key_of(layer, item, change)
+        draft = self._draft(key)
+        if not draft.holds(item):
+            raise NotFound(f"there is no feature {item!r} in {layer}")
+        draft.puts.pop(item, None)
+        if draft.stored is not None and item in set(draft.stored.ids):
+            draft.deletes.add(item)
+
+    def _key_of(self, layer: Layer, item: str, change: Mapping[str, Any]) -> PartKey:
+        """The part that an edit means: the named one, else the one that holds the id, else the usual one."""
+        level, name = change.get("level"), change.get("name")
+        fitting = sorted(
+            k
+            for k in {*self._keys, *self._drafts}
+            if k.layer == layer and level in (None, k.level) and name in (None, k.name)
+        )
+        holding = [k for k in fitting if self._draft(k).holds(item)]
+        if len(holding) > 1:
+            where = ", ".join(f"level {k.level} name {k.name}" for k in holding)
+            raise Invalid(f"several parts of {layer} hold {item!r}: give 'level' and 'name', one of: {where}")
+        if holding:
+            return holding[0]
+        usual = PartKey(layer, level or GROUND, name or _USUAL_NAME[layer])
+        same = [k for k in fitting if k.level == usual.level]
+        return same[0] if layer == "topology" and len(same) == 1 else usual
+
+    def _geometry(self, feature: Mapping[str, Any], change: Mapping[str, Any]) -> tuple[Any, bool]:
+        """A feature's geometry and whether it is local: ``place`` is local metres (JSON-FG), else ``crs`` decides."""
+        place = feature.get("place")
+        local = place is not None or self._is_local(change)
+        shape = place if place is not None else feature.get("geometry")
+        if shape is None:
+            return None, local
+        return _shape(shape), local
+
+    def _is_local(self, change: Mapping[str, Any]) -> bool:
+        crs = change.get("crs") or ("wgs84" if self._base.datum is not None else "local")
+        if crs not in ("local", "wgs84"):
+            raise Invalid(f"crs must be local or wgs84, got {crs!r}")
+        return bool(crs == "local")
+
+    def _cells(self, change: Mapping[str, Any]) -> None:
+        key = self._grid_key(change)
+        if key not in self._grids:
+            stored = self._store.load(self._base, [key]).parts[key]
+            assert isinstance(stored, OccupancyGrid)
+            self._grids[key] = stored
+        grid, value = self._grids[key], change.get("value")
+        if isinstance(value, bool) or not isinstance(value, int) or not (0 <= value <= OCCUPIED or value == UNKNOWN):
+            raise Invalid(f"value must be 0 to 100, or 255 for unknown, got {value!r}")
+        polygon = _shape(change.get("polygon"))
+        if polygon.geom_type not in ("Polygon", "MultiPolygon") or not polygon.is_valid:
+            reason = shapely.is_valid_reason(polygon)
+            raise Invalid(f"polygon must be a valid GeoJSON Polygon or MultiPolygon, got {polygon.geom_type}: {reason}")
+        if not self._is_local(change):
+            polygon = self._other(polygon, False)
+        mask = cells_within(grid, polygon)
+        if not mask.any():
+            raise Invalid(f"the polygon covers no cell centre of grid {key.name}")
+        cells = grid.cells.copy()
+        cells[mask] = value
+        self._grids[key] = replace(grid, cells=cells)
+
+    def _grid_key(self, change: Mapping[str, Any]) -> PartKey:
+        name, level = change.get("grid"), change.get("level")
+        fitting = sorted(
+            k for k in self._keys if k.layer == "occupancy" and level in (None, k.level) and name in (None, k.name)
+        )
+        by_name = defaultdict(list)
+        for key in fitting:
+            by_name[key.name].append(key)
+        if not fitting:
+            known = ", ".join(sorted(k.name for k in self._keys if k.layer == "occupancy")) or "none"
+            raise NotFound(f"there is no grid {name!r}; known grids: {known}")
+        if len(fitting) == 1:
+            return fitting[0]
+        if name is None and len(by_name["map"]) == 1:
+            return by_name["map"][0]
+        raise Invalid(f"several grids fit: name one with 'grid' (and 'level'): {', '.join(k.name for k in fitting)}")
+
+
+def cells_within(grid: OccupancyGrid, polygon: Any) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """bool [height, width], row 0 at the bottom: cells whose centre lies in a polygon of the local frame."""
+    x, y, yaw = grid.origin
+    c, s = np.cos(yaw), np.sin(yaw)
+
+    def to_cells(points: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
+        dx, dy = points[:, 0] - x, points[:, 1] - y
+        return np.column_stack([(dx * c + dy * s), (dy * c - dx * s)]) / grid.resolution
+
+    shape = shapely.transform(polygon, to_cells)
+    left, bottom, right, top = shape.bounds
+    columns = np.arange(max(0, int(np.floor(left))), min(grid.width, int(np.ceil(right)) + 1))
+    rows = np.arange(max(0, int(np.floor(bottom))), min(grid.height, int(np.ceil(top)) + 1))
+    mask = np.zeros(grid.cells.shape, bool)
+    if not len(columns) or not len(rows):
+        return mask
+    shapely.prepare(shape)
+    for start in range(0, len(rows), 512):  # blocks, so that a large polygon takes bounded memory
+        block = rows[start : start + 512]
+        u, v = np.meshgrid(columns + 0.5, block + 0.5)
+        inside = shapely.contains_xy(shape, u, v)
+        mask[block[0] : block[-1] + 1, columns[0] : columns[-1] + 1] = inside
+    return mask
+
+
+def _shape(geometry: Any) -> Any:
+    if not isinstance(geometry, Mapping):
+        raise Invalid(f"a geometry must be a GeoJSON object, got {type(geometry).__name__}")
+    try:
+        return shapely.geometry.shape(geometry)
+    except Exception as error:
+        raise Invalid(f"not a GeoJSON geometry: {error}") from error
+
+
+def _network_item(item: str, properties: Mapping[str, Any]) -> Mapping[str, Any]:
+    kind = properties.get("kind") or ("edge" if "source" in properties else "node")
+    if kind not in ("node", "edge"):
+        raise Invalid(f"a feature of the topology has kind node or edge, got {kind!r}")
+    if kind == "edge" and not all(isinstance(properties.get(e), str) for e in ("source", "target")):
+        raise Invalid(f"edge {item} needs 'source' and 'target', the ids of its nodes")
+    return {**properties, "kind": kind}

@@ -1,0 +1,174 @@
+"""In a worker: an upload's files -> what it would change. Reads the store, writes nothing."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+
+from app import bundle
+from app.bundle import Bundle, Hints, Known
+from app.errors import Invalid, Problem
+from app.formats import Limits
+from app.ingest.match import match_ids
+from app.model.features import Features
+from app.model.frame import Datum
+from app.model.grid import UNKNOWN, OccupancyGrid
+from app.model.layers import Part, PartKey, Resources, join_levels
+from app.store import Store
+from app.store.changes import KEEP, Changes, Prepared, Provenance, Put, Replace
+from app.store.values import Version
+
+Mode = Literal["replace", "merge"]
+
+
+@dataclass(frozen=True, slots=True)
+class FileNote:
+    """An uploaded file, or a member of an uploaded archive: what it is and whether it is used."""
+
+    name: str
+    format: str | None
+    used: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """What an upload would change, with all that was doubtful. members: content of unpacked archives."""
+
+    prepared: Prepared
+    notes: tuple[FileNote, ...]
+    warnings: tuple[Problem, ...]
+    members: Mapping[str, bytes]
+
+
+@lru_cache(maxsize=4)
+def open_store(database_url: str, blob_dir: str) -> Store:
+    """A worker's own view of the store, kept between jobs."""
+    return Store(database_url, Path(blob_dir), readonly=True)
+
+
+def prepare_upload(
+    database_url: str,
+    blob_dir: str,
+    base: Version,
+    paths: Mapping[str, Path],
+    hints: Hints,
+    mode: Mode,
+    limits: Limits,
+) -> Proposal:
+    """Read spooled files against a version: the version they would make. Raises what ``app.bundle.read`` raises."""
+    store = open_store(database_url, blob_dir)
+    uploaded = {name: path.read_bytes() for name, path in paths.items()}
+    files = bundle.unpack(uploaded, limits)
+    told = bundle.read(files, hints, Known(base.datum, _fence(store, base)), limits)
+    operations = [_operation(store, base, told, key, mode, files) for key in sorted(told.parts)]
+    warnings = list(told.warnings)
+    datum: Any = KEEP
+    if told.datum is not None and told.datum != base.datum:
+        datum = told.datum
+        warnings += moved(base, told.datum)
+    levels: Any = KEEP
+    if told.levels:
+        known = join_levels(base.levels, told.levels)
+        levels = known if known != base.levels else KEEP
+    prepared = store.prepare(base, Changes(tuple(operations), datum, levels))
+    notes = [FileNote(name, use.format, use.used) for name, use in told.files.items()]
+    notes += [FileNote(name, "zip", True) for name in uploaded.keys() - files.keys()]
+    members = {name: files[name] for name in files.keys() - uploaded.keys()}
+    return Proposal(prepared, tuple(sorted(notes, key=lambda n: n.name)), tuple(warnings), members)
+
+
+def prepare_changes(database_url: str, blob_dir: str, base: Version, changes: Changes) -> Prepared:
+    """In a worker: what these changes would make of a version."""
+    return open_store(database_url, blob_dir).prepare(base, changes)
+
+
+def moved(base: Version, datum: Datum) -> list[Problem]:
+    """The warning that belongs to a new datum."""
+    if base.datum is None:
+        return []
+    return [
+        Problem(
+            f"the datum moves from {base.datum.latitude!r}, {base.datum.longitude!r} (heading {base.datum.heading:g}°) "
+            f"to {datum.latitude!r}, {datum.longitude!r} (heading {datum.heading:g}°): local items keep their metres, "
+            "items on earth keep their place, so the two move against each other"
+        )
+    ]
+
+
+def _fence(store: Store, base: Version) -> shapely.Polygon | None:
+    keys = [e.key for e in base.parts if e.key.layer == "location" and e.count]
+    for part in store.load(base, keys).parts.values() if keys else ():
+        if isinstance(part, Features) and len(part):
+            polygon: shapely.Polygon = part.geometry[0]
+            return polygon
+    return None
+
+
+def _operation(
+    store: Store, base: Version, told: Bundle, key: PartKey, mode: Mode, files: Mapping[str, bytes]
+) -> Replace | Put:
+    part = told.parts[key]
+    names, origin = told.origin[key]
+    digest = hashlib.sha256()
+    for name in names:
+        digest.update(hashlib.sha256(files[name]).digest())
+    provenance = Provenance(
+        "raw", origin, names, digest.hexdigest(), attribution=tuple(_attribution(part)) if part else ()
+    )
+    held = any(e.key == key for e in base.parts)
+    if isinstance(part, Features):
+        if held and key.layer in ("topology", "objects", "zones"):
+            part = match_ids(store, base, key, part)
+        if mode == "merge":
+            return Put(key, part, provenance)
+    elif mode == "merge" and held:
+        old = store.load(base, [key]).parts[key]
+        if isinstance(part, OccupancyGrid) and isinstance(old, OccupancyGrid):
+            part = merge_grids(old, part, key.name)
+        elif isinstance(part, Resources) and isinstance(old, Resources):
+            part = Resources({**old.files, **part.files})
+    return Replace(key, part, provenance)
+
+
+def _attribution(part: Part) -> list[str]:
+    stated = part.document.get("attribution", ()) if isinstance(part, Features) else ()
+    return [str(line) for line in stated]
+
+
+def merge_grids(old: OccupancyGrid, new: OccupancyGrid, name: str) -> OccupancyGrid:
+    """The new grid's known cells over the old grid's, on a canvas that holds both; unknown cells overwrite nothing.
+
+    Both must have one resolution and yaw, and origins a whole number of cells apart (to a hundredth of a cell).
+    """
+    if abs(old.resolution - new.resolution) > 1e-9 or abs(old.origin[2] - new.origin[2]) > 1e-9:
+        raise Invalid(
+            f"grid {name}: merging needs the stored grid's resolution {old.resolution!r} and yaw {old.origin[2]!r}, "
+            f"the upload has {new.resolution!r} and {new.origin[2]!r}; use mode=replace, or bring them to one resolution"
+        )
+    yaw, res = old.origin[2], old.resolution
+    c, s = np.cos(yaw), np.sin(yaw)
+    dx, dy = new.origin[0] - old.origin[0], new.origin[1] - old.origin[1]
+    across, up = (dx * c + dy * s) / res, (dy * c - dx * s) / res
+    column, row = round(across), round(up)
+    if abs(across - column) > 0.01 or abs(up - row) > 0.01:
+        raise Invalid(
+            f"grid {name}: merging needs origins a whole number of cells apart; they are {across:.3f} × {up:.3f} cells "
+            "apart: use mode=replace, or resample the upload onto the stored grid"
+        )
+    left, bottom = min(0, column), min(0, row)
+    width = max(old.width, column + new.width) - left
+    height = max(old.height, row + new.height) - bottom
+    cells = np.full((height, width), UNKNOWN, np.uint8)
+    cells[-bottom : -bottom + old.height, -left : -left + old.width] = old.cells
+    window = cells[row - bottom : row - bottom + new.height, column - left : column - left + new.width]
+    np.copyto(window, new.cells, where=new.cells != UNKNOWN)
+    x = old.origin[0] + (left * c - bottom * s) * res
+    y = old.origin[1] + (left * s + bottom * c) * res
+    return replace(old, cells=cells, origin=(float(x), float(y), yaw))

@@ -1,0 +1,336 @@
+"""The service that takes changes in: uploads, edits, reverts, a new datum. One change = one version, or nothing."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import orjson
+
+from app import formats
+from app.bundle import Hints
+from app.errors import Conflict, Invalid, Problem, StaleParent, UnreadableFile
+from app.formats import Limits
+from app.ingest.edits import edit_changes
+from app.ingest.prepare import Mode, Proposal, moved, prepare_changes, prepare_upload
+from app.model.frame import GROUND, Datum
+from app.model.layers import Layer
+from app.pool import WorkerDied
+from app.store import Store
+from app.store.changes import KEEP, Changes, Prepared
+from app.store.values import Idempotency, Source, Version
+
+Run = Callable[..., Any]
+"""``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""
+
+TRIES = 50
+"""How often a change without ``If-Match`` is brought onto a head that has moved meanwhile."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpooledFile:
+    """An uploaded file on disk; ``name`` is the relative path that the client gave."""
+
+    name: str
+    path: Path
+    size: int
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """What a client sent and said of it."""
+
+    files: tuple[SpooledFile, ...]
+    format: str | None = None
+    layer: Layer | None = None
+    level: str = GROUND
+    grid: str | None = None
+    mode: Mode = "replace"
+    message: str = ""
+    dry_run: bool = False
+    options: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a change. body: the contract's version JSON; ``version`` in it is null for a dry run."""
+
+    status: Literal["created", "unchanged", "dry_run", "replayed"]
+    version: Version | None
+    body: dict[str, Any]
+
+
+class Ingest:
+    """All ways to make a version."""
+
+    def __init__(self, store: Store, run: Run, limits: Limits) -> None:
+        self._store, self._run, self._limits = store, run, limits
+
+    def upload(
+        self,
+        environment: str,
+        upload: Upload,
+        *,
+        author: str,
+        if_match: str | None = None,
+        idempotency: str | None = None,
+    ) -> Outcome:
+        """Files -> one version, all or nothing.
+
+        Raises BadUpload (nothing is stored), Invalid, StaleParent (``if_match`` names another version), Conflict (the
+        idempotency key was used for something else), Unavailable.
+        """
+        _check_upload(upload)
+        key = _idempotency(idempotency, _fingerprint(upload))
+        replayed = self._replayed(environment, key)
+        if replayed is not None:
+            return replayed
+        hints = Hints(upload.format, upload.layer, upload.level, upload.grid, dict(upload.options))
+        paths = {f.name: f.path for f in upload.files}
+        for last in _tries(if_match):
+            base = self._store.version(environment)
+            check_if_match(if_match, base)
+            proposal: Proposal = self._in_worker(prepare_upload, base, paths, hints, upload.mode, self._limits)
+            notes = {n.name: n for n in proposal.notes}
+            if upload.dry_run:
+                sources = [
+                    Source(f.name, f.size, f.sha256, notes[f.name].format, notes[f.name].used) for f in upload.files
+                ]
+                return Outcome("dry_run", None, self._preview(base, proposal, sources, author, upload.message))
+            sources = self._keep(upload, proposal)
+            try:
+                return self._commit(
+                    environment, base, proposal.prepared, author, upload.message, sources, proposal.warnings, key
+                )
+            except StaleParent:
+                if last:
+                    raise
+        raise StaleParent(f"{environment} changes faster than this upload can be taken in: try again")
+
+    def edit(
+        self,
+        environment: str,
+        changes: Sequence[Mapping[str, Any]],
+        *,
+        message: str,
+        author: str,
+        if_match: str | None = None,
+        idempotency: str | None = None,
+    ) -> Outcome:
+        """The contract's edits -> one version. Raises Invalid (dangling edges, unknown ids), StaleParent, Conflict."""
+        key = _idempotency(idempotency, _digest(["edit", list(changes), message]))
+        replayed = self._replayed(environment, key)
+        if replayed is not None:
+            return replayed
+        for last in _tries(if_match):
+            base = self._store.version(environment)
+            check_if_match(if_match, base)
+            wanted, warnings = edit_changes(self._store, base, changes)
+            prepared: Prepared = self._in_worker(prepare_changes, base, wanted)
+            try:
+                return self._commit(environment, base, prepared, author, message, (), warnings, key)
+            except StaleParent:
+                if last:
+                    raise
+        raise StaleParent(f"{environment} changes faster than this edit can be taken in: try again")
+
+    def revert(
+        self,
+        environment: str,
+        to: int,
+        *,
+        message: str,
+        author: str,
+        if_match: str | None = None,
+        idempotency: str | None = None,
+    ) -> Outcome:
+        """A new version with an old one's content."""
+        key = _idempotency(idempotency, _digest(["revert", to, message]))
+        replayed = self._replayed(environment, key)
+        if replayed is not None:
+            return replayed
+        for last in _tries(if_match):
+            base = self._store.version(environment)
+            check_if_match(if_match, base)
+            target = self._store.version(environment, to)
+            if target.root == base.root:
+                return Outcome("unchanged", base, base.as_dict())
+            try:
+                text = message or f"Revert to version {to}"
+                made = self._store.revert(
+                    environment, to, author=author, message=text, expected=base.number, idempotency=key
+                )
+                return Outcome("created", made, made.as_dict())
+            except StaleParent:
+                if last:
+                    raise
+        raise StaleParent(f"{environment} changes faster than it can be reverted: try again")
+
+    def set_datum(
+        self, environment: str, datum: Datum, *, author: str, if_match: str | None = None, message: str = ""
+    ) -> Outcome:
+        """A version with another datum: local items keep their metres, wgs84 items their place on earth."""
+        for last in _tries(if_match):
+            base = self._store.version(environment)
+            check_if_match(if_match, base)
+            if base.datum == datum:
+                return Outcome("unchanged", base, base.as_dict())
+            prepared = self._store.prepare(base, Changes((), datum, KEEP))
+            try:
+                text = message or "Set the datum"
+                return self._commit(environment, base, prepared, author, text, (), moved(base, datum), None)
+            except StaleParent:
+                if last:
+                    raise
+        raise StaleParent(f"{environment} changes faster than its datum can be set: try again")
+
+    def _commit(
+        self,
+        environment: str,
+        base: Version,
+        prepared: Prepared,
+        author: str,
+        message: str,
+        sources: Sequence[Source],
+        warnings: Sequence[Problem],
+        key: Idempotency | None,
+    ) -> Outcome:
+        if not prepared.changed:
+            same = self._store.add_sources(environment, base.number, sources) if sources else base
+            return Outcome("unchanged", same, {**same.as_dict(), "warnings": [w.as_dict() for w in warnings]})
+        made = self._store.commit(
+            environment,
+            prepared,
+            author=author,
+            message=message,
+            sources=tuple(sources),
+            warnings=tuple(warnings),
+            idempotency=key,
+        )
+        return Outcome("created", made, made.as_dict())
+
+    def _replayed(self, environment: str, key: Idempotency | None) -> Outcome | None:
+        """The answer that was given to this key before; Conflict where it came with another request."""
+        if key is None:
+            return None
+        known = self._store.idempotent(environment, key.key)
+        if known is None:
+            return None
+        fingerprint, number = known
+        if fingerprint != key.fingerprint:
+            raise Conflict(f"the Idempotency-Key {key.key!r} was used for another request: choose a new one")
+        version = self._store.version(environment, number)
+        return Outcome("replayed", version, version.as_dict())
+
+    def _keep(self, upload: Upload, proposal: Proposal) -> list[Source]:
+        """Store the originals byte for byte, before the version that names them."""
+        notes = {n.name: n for n in proposal.notes}
+        names = [f.name for f in upload.files] + list(proposal.members)
+        contents: list[bytes | Path] = [f.path for f in upload.files]
+        contents += list(proposal.members.values())
+        digests = self._store.blobs.put_many(contents)
+        sizes = [f.size for f in upload.files] + [len(data) for data in proposal.members.values()]
+        return [
+            Source(name, size, digest, notes[name].format, notes[name].used)
+            for name, size, digest in zip(names, sizes, digests, strict=True)
+        ]
+
+    def _in_worker(self, function: Callable[..., Any], *args: Any) -> Any:
+        try:
+            return self._run(function, self._store.database_url, str(self._store.blob_dir), *args)
+        except WorkerDied as error:
+            raise UnreadableFile(f"the upload could not be read: {error.detail}") from error
+
+    def _preview(
+        self, base: Version, proposal: Proposal, sources: Sequence[Source], author: str, message: str
+    ) -> dict[str, Any]:
+        """The version that an upload would make, without a number."""
+        p = proposal.prepared
+        preview = Version(
+            environment=base.environment,
+            number=base.number,
+            root=p.root,
+            parent=base.number,
+            author=author,
+            message=message,
+            time=base.time,
+            changes=p.changes,
+            sources=tuple(sources),
+            warnings=proposal.warnings,
+            datum=p.datum,
+            levels=p.levels,
+            parts=p.parts,
+        )
+        return {**preview.as_dict(), "version": None, "time": None}
+
+
+def check_if_match(header: str | None, head: Version) -> None:
+    """StaleParent unless the header (``"3"``, ``"<root>"``, a list, or ``*``) names the head."""
+    if header is None:
+        return
+    tags = [t.strip().removeprefix("W/").strip('"') for t in header.split(",")]
+    if "*" not in tags and str(head.number) not in tags and head.root not in tags:
+        raise StaleParent(
+            f"the head of {head.environment} is version {head.number} (root {head.root}), not {header}: "
+            "fetch it, look at what changed, and send the change again on top of it"
+        )
+
+
+def _check_upload(upload: Upload) -> None:
+    if not upload.files:
+        raise Invalid("the upload has no file: send at least one as form field 'files'")
+    if upload.mode not in ("replace", "merge"):
+        raise Invalid(f"mode must be replace or merge, got {upload.mode!r}")
+    if upload.format is not None:
+        formats.get_format(upload.format)
+    seen: set[str] = set()
+    for file in upload.files:
+        problem = bad_name(file.name)
+        if problem is None and file.name in seen:
+            problem = "this name is used twice"
+        if problem:
+            raise Invalid(
+                f"the file name {file.name[:200]!r} cannot be used: {problem}", [Problem(problem, file.name[:200])]
+            )
+        seen.add(file.name)
+
+
+def bad_name(name: str) -> str | None:
+    """Why an uploaded file may not be called this, or None. Names are relative paths with forward slashes."""
+    if not name or len(name) > 1024:
+        return "it must have 1 to 1024 characters"
+    if not name.isprintable():
+        return "it has control characters"
+    if "\\" in name or name.startswith("/") or (len(name) > 1 and name[1] == ":"):
+        return "it must be a relative path with forward slashes"
+    if any(part in ("", ".", "..") for part in name.split("/")):
+        return "it must not contain empty, '.' or '..' parts"
+    return None
+
+
+def _tries(if_match: str | None) -> list[bool]:
+    """For each try, whether it is the last: with a condition there is only one."""
+    count = 1 if if_match not in (None, "*") else TRIES
+    return [k == count - 1 for k in range(count)]
+
+
+def _idempotency(key: str | None, fingerprint: str) -> Idempotency | None:
+    if key is None:
+        return None
+    if not 1 <= len(key) <= 255 or not key.isprintable():
+        raise Invalid("an Idempotency-Key must have 1 to 255 printable characters")
+    return Idempotency(key, fingerprint)
+
+
+def _fingerprint(upload: Upload) -> str:
+    said = [upload.format, upload.layer, upload.level, upload.grid, upload.mode, upload.message, upload.dry_run]
+    files = sorted([f.name, f.sha256] for f in upload.files)
+    return _digest(["upload", said, dict(sorted(upload.options.items())), files])
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(orjson.dumps(value, option=orjson.OPT_SORT_KEYS)).hexdigest()

@@ -1,0 +1,176 @@
+"""A pool of worker processes for parsing and conversion: limits on memory and time, and a crash costs one job.
+
+Hostile files are read here, never in the server's own process (security, reading 1). Workers are spawned, since the
+server holds native threads; a worker that dies or overruns is replaced, and workers end with their parent.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import logging
+import multiprocessing
+import os
+import queue
+import resource
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+from app.errors import FleetMapError, TooLarge, Unavailable
+
+log = logging.getLogger(__name__)
+
+_spawn = multiprocessing.get_context("spawn")
+
+
+class WorkerDied(FleetMapError):
+    """The job ended its process (a crash, or out of memory) or overran its time."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Worker:
+    process: BaseProcess
+    pipe: Connection
+
+
+class Pool:
+    """At most ``workers`` jobs at once, ``waiting`` more in line; a further one is told to come again later."""
+
+    def __init__(
+        self,
+        workers: int = 2,
+        *,
+        memory_bytes: int = 8 * 2**30,
+        seconds: float = 300.0,
+        waiting: int = 64,
+        warm: tuple[str, ...] = (),
+    ) -> None:
+        self._memory_bytes, self._seconds, self._warm = memory_bytes, seconds, warm
+        self._slots = threading.BoundedSemaphore(workers + waiting)
+        self._idle: queue.LifoQueue[_Worker | None] = queue.LifoQueue()
+        self._workers: dict[int, _Worker] = {}
+        self._lock = threading.Lock()
+        self._closed = False
+        for _ in range(workers):
+            self._idle.put(None)  # started when first needed, or by start()
+        self._count = workers
+
+    def start(self) -> None:
+        """Start all workers now, so that the first job does not pay for their imports."""
+        taken = [self._idle.get() for _ in range(self._count)]
+        for worker in taken:
+            self._idle.put(worker or self._new())
+
+    def run(self, function: Callable[..., Any], *args: Any, seconds: float | None = None) -> Any:
+        """Call a module-level function in a worker and return its result; blocks, so call it from a thread.
+
+        Raises what the function raises; WorkerDied where the process ended or overran; Unavailable where too much
+        waits already.
+        """
+        if not self._slots.acquire(blocking=False):
+            raise Unavailable("too many conversions are waiting: try again in a few seconds")
+        try:
+            if self._closed:
+                raise Unavailable("the server is stopping")
+            worker, healthy = self._idle.get(), False
+            try:
+                worker = worker or self._new()
+                ok, value = _ask(worker, function, args, self._seconds if seconds is None else seconds)
+                healthy = True
+            finally:
+                if not healthy:
+                    self._end(worker)
+                self._idle.put(worker if healthy else None)
+        finally:
+            self._slots.release()
+        if not ok:
+            raise value
+        return value
+
+    def close(self) -> None:
+        """End all workers."""
+        self._closed = True
+        with self._lock:
+            workers = list(self._workers.values())
+        for worker in workers:
+            self._end(worker)
+
+    def _new(self) -> _Worker:
+        ours, theirs = _spawn.Pipe()
+        arguments = (theirs, os.getpid(), self._memory_bytes, self._warm)
+        process = _spawn.Process(target=_work, args=arguments, daemon=True, name="fleetmap-worker")
+        process.start()
+        theirs.close()
+        worker = _Worker(process, ours)
+        with self._lock:
+            self._workers[id(worker)] = worker
+        return worker
+
+    def _end(self, worker: _Worker | None) -> None:
+        if worker is None:
+            return
+        with self._lock:
+            self._workers.pop(id(worker), None)
+        worker.process.kill()
+        worker.process.join(5.0)
+        worker.pipe.close()
+
+
+def _ask(worker: _Worker, function: Callable[..., Any], args: tuple[Any, ...], seconds: float) -> tuple[bool, Any]:
+    """Whether the function returned, and what it returned or raised."""
+    try:
+        worker.pipe.send((function.__module__, function.__qualname__, args))
+        if not worker.pipe.poll(seconds):
+            raise WorkerDied(f"it took longer than {seconds:g} seconds and was stopped")
+        ok, value = worker.pipe.recv()
+    except (EOFError, OSError) as error:
+        worker.process.join(1.0)
+        code = worker.process.exitcode
+        raise WorkerDied(f"the process that worked on it ended (exit code {code}): damaged or too large") from error
+    return ok, value
+
+
+def _work(pipe: Connection, parent: int, memory_bytes: int, warm: tuple[str, ...]) -> None:
+    """A worker's life: take a job, answer, until the parent closes the pipe or dies."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if memory_bytes:
+        resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
+    threading.Thread(target=_die_with, args=(parent,), daemon=True).start()
+    for name in warm:
+        importlib.import_module(name)
+    while True:
+        try:
+            module, function, args = pipe.recv()
+        except (EOFError, OSError):
+            return
+        try:
+            target: Any = importlib.import_module(module)
+            for part in function.split("."):
+                target = getattr(target, part)
+            answer = (True, target(*args))
+        except MemoryError:
+            answer = (False, TooLarge("it needs more memory than an upload may use"))
+        except FleetMapError as error:
+            answer = (False, error)
+        except Exception as error:  # noqa: BLE001  a bug of ours: told to the parent with its trace, for the log
+            trace = "".join(traceback.format_exception(error))
+            answer = (False, RuntimeError(f"{type(error).__name__} in a worker\n{trace}"))
+        try:
+            pipe.send(answer)
+        except (OSError, BrokenPipeError):
+            return
+        except Exception as error:  # noqa: BLE001  an answer that cannot be pickled is a bug of ours too
+            with contextlib.suppress(OSError):
+                pipe.send((False, RuntimeError(f"a worker's answer could not be sent: {error}")))
+
+
+def _die_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
