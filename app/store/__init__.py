@@ -33,6 +33,9 @@ from app.store.values import (
 class Store:
     """One database and one blob folder. Thread-safe; cheap to open again in a worker process."""
 
+    database_url: str
+    blob_dir: Path
+    readonly: bool
     blobs: Blobs
 
     def __init__(self, database_url: str, blob_dir: Path, *, readonly: bool = False) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -14,8 +14,8 @@ class Blobs:
         """Store bytes or a file's content durably; the SHA-256."""
         raise NotImplementedError
 
-    def put_many(self, files: Mapping[str, bytes | Path]) -> dict[str, str]:
-        """Store several files with one set of fsyncs; name -> SHA-256."""
+    def put_many(self, files: Sequence[bytes | Path]) -> list[str]:
+        """Store several files with one set of fsyncs; their SHA-256s in the same order."""
         raise NotImplementedError
 
     def get(self, sha256: str) -> bytes:

@@ -10,7 +10,8 @@ from typing import Any, Final, Literal
 from app.model.features import Features
 from app.model.frame import Datum, Level
 from app.model.layers import Part, PartKey
-from app.store.values import PartEntry, Provenance
+from app.store.values import PartEntry
+from app.store.values import Provenance as Provenance
 
 
 class Keep(enum.Enum):
@@ -21,6 +22,9 @@ class Keep(enum.Enum):
 
 KEEP: Final = Keep.KEEP
 
+RAW: Final = Provenance()
+"""It stands in a source."""
+
 
 @dataclass(frozen=True, slots=True)
 class Replace:
@@ -28,7 +32,7 @@ class Replace:
 
     key: PartKey
     part: Part
-    provenance: Provenance = Provenance()
+    provenance: Provenance = RAW
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +41,7 @@ class Put:
 
     key: PartKey
     features: Features
-    provenance: Provenance = Provenance()
+    provenance: Provenance = RAW
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +67,7 @@ class Changes:
     """Operations in order, and the datum and levels where they are to change."""
 
     operations: tuple[Operation, ...] = ()
-    datum: Datum | None | Literal[Keep.KEEP] = KEEP
+    datum: Datum | Literal[Keep.KEEP] | None = KEEP
     levels: tuple[Level, ...] | Literal[Keep.KEEP] = KEEP
 
 
