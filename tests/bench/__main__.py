@@ -1,0 +1,250 @@
+"""Measure and print ratios: conversions to their floors, first GET to the bare conversion, GETs to a peer."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+from rich.console import Console
+from rich.table import Table
+
+from app.bundle import Hints
+from app.convert import offline
+from app.model.frame import Datum
+from tests.bench import floors, http
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/"
+ALLOWED_MS = 15.0
+HERE = Datum(53.268642038, -0.524509505881)
+
+
+def best(work: Callable[[], Any], tries: int) -> float:
+    """Milliseconds of the fastest of several tries, after one that does not count."""
+    work()
+    times = []
+    for _ in range(tries):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return min(times) * 1e3
+
+
+def conversions(tries: int) -> list[dict[str, Any]]:
+    """Our conversion against its floor, taken in turns."""
+
+    def data(name: str) -> bytes:
+        return (DATA / name).read_bytes()
+
+    cases: list[tuple[str, str, dict[str, bytes], str, dict[str, Any], Callable[[], Any]]] = []
+    for place in ("urban-usa-mn-minnesota-zoo", "urban-usa-fl-miami-subberbs", "urban-netherlands-subburbs"):
+        osm = data(f"osm/{place}/osm.xml")
+        cases.append(("osm → tmap2", place, {"map.osm": osm}, "tmap2", {}, lambda d=osm: floors.osm_to_tmap2(d)))
+    for name in (FARM + "topological/r_sp_man_tmap.kml", "kml/riseholme_park_farm_mid_19/mid_19_man_tmap.kml"):
+        kml = data(name)
+        more = {"hints": Hints(layer="topology")}
+        cases.append(
+            (
+                "kml → tmap2",
+                name.rpartition("/")[2],
+                {"a.kml": kml},
+                "tmap2",
+                more,
+                lambda d=kml: floors.kml_to_tmap2(d),
+            )
+        )
+    tmap2 = data(FARM + "topological/network.tmap2.yaml")
+    cases.append(
+        (
+            "tmap2 → kml",
+            "strawberry",
+            {"a.tmap2.yaml": tmap2},
+            "kml",
+            {"datum": HERE},
+            lambda: floors.tmap2_to_kml(tmap2),
+        )
+    )
+    datum = data("datum/riseholme_park_farm_general_south_pathway/datum_autogen.yaml")
+    cases.append(("datum → kml", "south_pathway", {"datum.yaml": datum}, "kml", {}, lambda: floors.datum_to_kml(datum)))
+    described, picture = data(FARM + "metric/map/map.yaml"), data(FARM + "metric/map/map.png")
+    grid = {"map.yaml": described, "map.png": picture}
+    cases.append(
+        (
+            "occupancy grid → kml",
+            "strawberry 4000²",
+            grid,
+            "kml",
+            {"datum": HERE},
+            lambda: floors.grid_to_kml(described, picture),
+        )
+    )
+    rows = []
+    for what, name, files, to, more, floor in cases:
+        low = best(floor, tries)
+        ours = best(lambda: offline(files, to, **more), tries)  # noqa: B023
+        bound = 2 * low + ALLOWED_MS
+        rows.append(
+            {
+                "conversion": what,
+                "input": name,
+                "floor_ms": low,
+                "ours_ms": ours,
+                "bound_ms": bound,
+                "holds": ours <= bound,
+            }
+        )
+    return rows
+
+
+def serving(tries: int) -> list[dict[str, Any]]:
+    """A running server: the first GET against the bare conversion, repeated GETs against a bare Starlette route."""
+    rows: list[dict[str, Any]] = []
+    port, peer = http.free_port(), http.free_port()
+    token = "bench-" + "0" * 40
+    with tempfile.TemporaryDirectory() as folder:
+        env = {"FLEETMAP_DATA_DIR": folder, "FLEETMAP_ADMIN_TOKEN": token, "FLEETMAP_MAX_UPLOADS_WAITING": "64"}
+        command = [sys.executable, "-m", "app.cli", "serve", "--host", "127.0.0.1", "--port", str(port)]
+        with http.serving(command, port, env), http.serving(http.bare(peer), peer):
+            auth = {"Authorization": f"Bearer {token}"}
+            with httpx.Client(base_url=f"http://127.0.0.1:{port}", headers=auth, timeout=120) as client:
+                rows += _first_gets(client, tries)
+                rows += _repeated(client, port, peer, auth)
+    return rows
+
+
+def _first_gets(client: httpx.Client, tries: int) -> list[dict[str, Any]]:
+    tmap2 = (DATA / FARM / "topological/network.tmap2.yaml").read_bytes()
+    osm = (DATA / "osm/urban-usa-mn-minnesota-zoo/osm.xml").read_bytes()
+    cases = (
+        ("first GET, tmap2 → kml", "network.tmap2.yaml", tmap2, "kml", {"datum": HERE}),
+        ("first GET, osm → tmap2", "map.osm", osm, "tmap2", {}),
+    )
+    rows = []
+    for what, name, data, to, more in cases:
+        bare = best(lambda: offline({name: data}, to, **more), tries)  # noqa: B023
+        times = []
+        for k in range(tries + 1):
+            env = f"bench-{to}-{k}"
+            body: dict[str, Any] = {"name": env}
+            if more:
+                body["datum"] = {"latitude": HERE.latitude + k * 1e-6, "longitude": HERE.longitude}
+            client.post("/api/v1/environments", json=body).raise_for_status()
+            # Each try is another content, so that nothing is in the cache: a node is moved by a micrometre-sized edit.
+            answer = client.post(f"/api/v1/environments/{env}/versions", files=[("files", (name, data))])
+            answer.raise_for_status()
+            if not more and k:
+                head = answer.json()["version"]
+                shift = {"datum": {"latitude": 44.7 + k * 1e-6, "longitude": -93.2}}
+                client.patch(f"/api/v1/environments/{env}", json=shift).raise_for_status()
+                assert head >= 1
+            start = time.perf_counter()
+            client.get(f"/maps/{env}/{to}").raise_for_status()
+            times.append((time.perf_counter() - start) * 1e3)
+        first = min(times[1:])
+        rows.append(
+            {
+                "what": what,
+                "peer": bare,
+                "ours": first,
+                "unit": "ms",
+                "ratio": first / bare,
+                "bound": "≤ 1.3",
+                "holds": first <= 1.3 * bare,
+            }
+        )
+    return rows
+
+
+def _repeated(client: httpx.Client, port: int, peer: int, auth: dict[str, str]) -> list[dict[str, Any]]:
+    client.post("/api/v1/environments", json={"name": "bench"}).raise_for_status()
+    small = b"datum_latitude: 53.26\ndatum_longitude: -0.52\n"
+    client.post("/api/v1/environments/bench/versions", files=[("files", ("datum.yaml", small))]).raise_for_status()
+    side = 316
+    grid = (
+        b"image: big.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
+    pixels = b"P5\n%d %d\n255\n" % (side, side) + bytes([254]) * (side * side)
+    files = [("files", ("big.yaml", grid)), ("files", ("big.pgm", pixels))]
+    client.post("/api/v1/environments/bench/versions", files=files).raise_for_status()
+    one, large = "/maps/bench/datum", "/maps/bench/occupancy_grid/big.pgm"
+    tag = client.get(one).headers["etag"]
+    rows = []
+    for what, ours_path, peer_path, more, peer_more, bound in (
+        ("repeated GET, 1 kB", one, "/1k", {}, {}, 0.6),
+        ("repeated GET, 100 kB", large, "/100k", {}, {}, 0.9),
+        ("repeated GET, 304", one, "/1k", {"If-None-Match": tag}, {"If-None-Match": '"tag"'}, 0.6),
+    ):
+        ours, theirs = [], []
+        for _ in range(3):  # in turns, so that a noisy machine is noisy to both
+            theirs.append(http.rate(peer, peer_path, peer_more))
+            ours.append(http.rate(port, ours_path, {**auth, **more}))
+        mine, bare = max(ours), max(theirs)
+        rows.append(
+            {
+                "what": what,
+                "peer": bare,
+                "ours": mine,
+                "unit": "1/s",
+                "ratio": mine / bare,
+                "bound": f"≥ {bound}",
+                "holds": mine >= bound * bare,
+            }
+        )
+    return rows
+
+
+def main() -> int:
+    """Print the tables (or JSON); exit status 1 where a bound does not hold."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
+    parser.add_argument("--tries", type=int, default=7, help="counted runs of each conversion (default 7)")
+    parser.add_argument("--json", action="store_true", help="machine-readable output")
+    parser.add_argument("--only", choices=["conversions", "serving"], help="one of the two tables")
+    arguments = parser.parse_args()
+    if not DATA.is_dir():
+        print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
+        return 2
+    converted = conversions(arguments.tries) if arguments.only != "serving" else []
+    served = serving(arguments.tries) if arguments.only != "conversions" else []
+    if arguments.json:
+        print(json.dumps({"conversions": converted, "serving": served}, indent=2))
+    else:
+        console = Console(width=110)
+        if converted:
+            table = Table("conversion", "input", "floor ms", "ours ms", "ours ÷ floor", "bound ms", "holds")
+            for r in converted:
+                ratio = f"{r['ours_ms'] / r['floor_ms']:.1f}"
+                table.add_row(
+                    r["conversion"],
+                    r["input"],
+                    f"{r['floor_ms']:.1f}",
+                    f"{r['ours_ms']:.1f}",
+                    ratio,
+                    f"{r['bound_ms']:.1f}",
+                    "yes" if r["holds"] else "NO",
+                )
+            console.print(table)
+        if served:
+            table = Table("served", "peer", "ours", "unit", "ratio", "bound", "holds")
+            for r in served:
+                table.add_row(
+                    r["what"],
+                    f"{r['peer']:.1f}",
+                    f"{r['ours']:.1f}",
+                    r["unit"],
+                    f"{r['ratio']:.2f}",
+                    r["bound"],
+                    "yes" if r["holds"] else "NO",
+                )
+            console.print(table)
+    return 0 if all(r["holds"] for r in [*converted, *served]) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
