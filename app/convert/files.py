@@ -13,8 +13,9 @@ from app.convert import make as making
 from app.convert import recipe as recipes
 from app.errors import MissingLayer, Problem
 from app.formats import Files, Limits
+from app.model.features import Features
 from app.model.frame import Datum
-from app.model.layers import Features, Layers, PartKey
+from app.model.layers import Layers, PartKey
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,8 @@ from app import derive, formats
 from app.convert.recipe import Chain
 from app.errors import Problem
 from app.formats import Format, WriteContext, _archive
-from app.model.layers import LAYERS, Features, Layers, PartKey
+from app.model.features import Features
+from app.model.layers import LAYERS, Layers, PartKey
 from app.store import Store
 from app.store.values import PartEntry, Version
 

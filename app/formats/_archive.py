@@ -351,9 +351,10 @@ def _deflated(packed: memoryview, e: _Entry) -> bytes:
     parts, total = [], 0
     for at in range(0, len(packed), _CHUNK):
         piece: bytes | memoryview = packed[at : at + _CHUNK]
-        while piece and not unpacker.eof:
+        while not unpacker.eof:
+            most = min(_CHUNK, e.size + 1 - total)
             try:
-                part = unpacker.decompress(piece, min(_CHUNK, e.size + 1 - total))
+                part = unpacker.decompress(piece, most)
             except zlib.error as error:
                 raise _damaged(str(error), e.name) from None
             piece = unpacker.unconsumed_tail
@@ -361,6 +362,8 @@ def _deflated(packed: memoryview, e: _Entry) -> bytes:
             parts.append(part)
             if total > e.size:
                 raise _unsafe(f"unfolds to more than the {e.size} bytes it declares", e.name)
+            if not piece and len(part) < most:
+                break
         if unpacker.eof:
             spare = len(unpacker.unused_data) + max(0, len(packed) - at - _CHUNK)
             if total != e.size or spare:

@@ -1,4 +1,4 @@
-"""YAML as plain JSON-like values, read safely: the only way in which formats read YAML.
+"""YAML as plain JSON-like values, read safely and written deterministically: the only way in which formats do it.
 
 ``load`` gives None, bool, int (64 bit), finite float, text, list and dict with text keys, and nothing else. What a
 plain scalar means follows PyYAML (YAML 1.1), which the robots' own tools use, without its traps:
@@ -16,6 +16,8 @@ the values from libyaml's events. Tests hold that both agree.
 Refused, each with its line: NaN and infinities, integers beyond 64 bit, duplicate keys, ``<<``, tags other than
 YAML's own scalars and collections, ``%TAG``, a second document, nesting deeper than ``Limits.yaml_depth``, more than
 ``Limits.yaml_nodes`` nodes, aliases that unfold to much more than the file, aliases to a collection that contains them.
+
+``text`` and ``block`` write what every reader takes for the same value: YAML 1.1 (PyYAML) and 1.2 (yaml-cpp, rapidyaml).
 """
 
 from __future__ import annotations
@@ -42,6 +44,11 @@ HEXADECIMAL = re.compile(r"[-+]?0x[0-9a-fA-F]+\Z")
 FLOAT = re.compile(r"[-+]?(?:(?:[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|[0-9]+[eE][-+][0-9]+)\Z")
 NOT_FINITE = re.compile(r"[-+]?\.(?:inf|Inf|INF|nan|NaN|NAN)\Z")
 
+_WIDE = r"\u00a0-\u1fff\u2030-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff"
+"""Characters beyond ASCII that libyaml takes for themselves anywhere: no further line breaks, no byte order mark."""
+
+_QUOTABLE = re.compile(rf"[ -~{_WIDE}]*\Z")
+
 INT64 = range(-(2**63), 2**63)
 LONGEST_NUMBER = 400
 """Characters; the longest float64 written out in full has fewer than 350."""
@@ -57,11 +64,11 @@ def load(data: bytes, limits: Limits) -> Any:
     """
     if len(data) > limits.text_bytes:
         raise TooLarge(f"the file has {len(data)} bytes of YAML; the limit is {limits.text_bytes}")
-    text = _text(data)
+    document = _text(data)
     try:
-        return _load_lines(text, limits)
+        return _load_lines(document, limits)
     except _NotSimpleError:
-        return _load_events(text, limits)
+        return _load_events(document, limits)
 
 
 def scalar(text: str) -> Any:
@@ -83,6 +90,65 @@ def scalar(text: str) -> Any:
     if NOT_FINITE.match(text):
         raise ValueError(f"{text} is not a finite number")
     return text
+
+
+_BARE = re.compile(r"[A-Za-z_$/][\w$/.+|()-]*(?: [\w$/.+|()][\w$/.+|()-]*)*\Z", re.ASCII)
+_RESERVED = frozenset(word.lower() for word in CONSTANTS) | {"y", "n", "nan", "inf", "infinity"}
+_ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "\0": "\\0"}
+LONGEST_KEY = 200
+
+
+def text(value: str | float | None) -> str:
+    """A scalar as YAML, on one line. Texts are quoted wherever some reader could take them for something else."""
+    if isinstance(value, str):
+        if _BARE.match(value) and value.lower() not in _RESERVED:
+            return value
+        if _QUOTABLE.match(value):
+            return "'" + value.replace("'", "''") + "'"
+        return '"' + "".join(_escaped(c) for c in value) + '"'
+    if isinstance(value, float):
+        said = repr(value)
+        # PyYAML takes 1e-09 for a text: it wants a point before the exponent.
+        return said.replace("e", ".0e") if "e" in said and "." not in said else said
+    return "null" if value is None else str(value).lower()
+
+
+def block(value: Any, column: int) -> str:
+    """What stands behind the colon of a key in this column, with the line break at the end; mappings by sorted keys."""
+    if isinstance(value, dict) and value:
+        return "\n" + mapping(value, column + 2)
+    if isinstance(value, (list, tuple)) and value:
+        return "\n" + "".join(_item(v, column) for v in value)
+    return " {}\n" if isinstance(value, dict) else " []\n" if isinstance(value, (list, tuple)) else f" {text(value)}\n"
+
+
+def mapping(value: dict[str, Any], column: int) -> str:
+    """A mapping that is not empty, its keys sorted and in this column, with the line break at the end."""
+    pad = " " * column
+    out = []
+    for key in sorted(value):
+        name = text(key)
+        if len(name) > LONGEST_KEY:  # beyond 1024 characters a key must be marked as one
+            out.append(f"{pad}? {name}\n{pad}:{block(value[key], column + 2)}")
+        else:
+            out.append(f"{pad}{name}:{block(value[key], column)}")
+    return "".join(out)
+
+
+def _item(value: Any, column: int) -> str:
+    pad = " " * column
+    if isinstance(value, dict) and value:
+        return f"{pad}- {mapping(value, column + 2)[column + 2 :]}"
+    return f"{pad}-{block(value, column + 2)}"
+
+
+def _escaped(character: str) -> str:
+    if character in _ESCAPES:
+        return _ESCAPES[character]
+    code = ord(character)
+    if _QUOTABLE.match(character):
+        return character
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
 def _int64(value: int) -> int:
@@ -223,9 +289,6 @@ def _load_events(text: str, limits: Limits) -> Any:
 class _NotSimpleError(Exception):
     """A line beyond the plain block layout, or an error: the reference decides."""
 
-
-_WIDE = r"\u00a0-\u1fff\u2030-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff"
-"""Characters beyond ASCII that libyaml takes for themselves anywhere: no further line breaks, no byte order mark."""
 
 _LINE = re.compile(
     rf"""

@@ -140,10 +140,11 @@ class _Session:
         return self._drafts[key]
 
     def _layer(self, change: Mapping[str, Any]) -> Layer:
-        layer = change.get("layer")
-        if layer not in VECTOR_LAYERS:
-            raise Invalid(f"layer must be one of {', '.join(sorted(VECTOR_LAYERS))}, got {layer!r}")
-        return layer
+        wanted = change.get("layer")
+        for layer in VECTOR_LAYERS:
+            if layer == wanted:
+                return layer
+        raise Invalid(f"layer must be one of {', '.join(sorted(VECTOR_LAYERS))}, got {wanted!r}")
 
     def _put(self, change: Mapping[str, Any]) -> None:
         layer, feature = self._layer(change), change.get("feature")

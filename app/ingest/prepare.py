@@ -150,7 +150,7 @@ def merge_grids(old: OccupancyGrid, new: OccupancyGrid, name: str) -> OccupancyG
     if abs(old.resolution - new.resolution) > 1e-9 or abs(old.origin[2] - new.origin[2]) > 1e-9:
         raise Invalid(
             f"grid {name}: merging needs the stored grid's resolution {old.resolution!r} and yaw {old.origin[2]!r}, "
-            f"the upload has {new.resolution!r} and {new.origin[2]!r}; use mode=replace, or bring them to one resolution"
+            f"the upload has {new.resolution!r} and {new.origin[2]!r}: use mode=replace, or bring them to one"
         )
     yaw, res = old.origin[2], old.resolution
     c, s = np.cos(yaw), np.sin(yaw)

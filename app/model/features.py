@@ -179,10 +179,10 @@ def from_columns(
 
 
 def concatenate(collections: Sequence[Features]) -> Features:
-    """All features of several collections; documents are joined by key, later ones win. Ids must be distinct."""
-    document: dict[str, Any] = {}
+    """All features of several collections; documents are merged, later ones win. Ids must be distinct."""
+    document: Properties = {}
     for c in collections:
-        document.update(c.document)
+        document = merge_documents(document, c.document)
     geometry = np.concatenate([c.geometry for c in collections]) if collections else np.empty(0, object)
     local = np.concatenate([c.local for c in collections]) if collections else np.empty(0, bool)
     return Features(
@@ -192,6 +192,19 @@ def concatenate(collections: Sequence[Features]) -> Features:
         local,
         document,
     )
+
+
+def merge_documents(a: Properties, b: Properties) -> dict[str, Any]:
+    """Both mappings as one, nested ones too: so the drawings of several files keep their styles side by side.
+
+    Where both say something else of the same key and not both with a mapping, ``b`` wins.
+    """
+    out = dict(a)
+    for key, value in b.items():
+        known = out.get(key)
+        nested = isinstance(known, Mapping) and isinstance(value, Mapping)
+        out[key] = merge_documents(known, value) if nested and known is not None else value
+    return out
 
 
 def points(coordinates: NDArray[np.float64]) -> NDArray[np.object_]:
