@@ -168,8 +168,7 @@ def _repeated(client: httpx.Client, port: int, peer: int, auth: dict[str, str]) 
     client.post("/api/v1/environments/bench/versions", files=[("files", ("datum.yaml", small))]).raise_for_status()
     side = 316
     grid = (
-        b"image: big.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\n"
-    grid += b"free_thresh: 0.196\n"
+        b"image: big.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
     )
     pixels = b"P5\n%d %d\n255\n" % (side, side) + bytes([254]) * (side * side)
     files = [("files", ("big.yaml", grid)), ("files", ("big.pgm", pixels))]
