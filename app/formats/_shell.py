@@ -1,0 +1,213 @@
+"""Variables of environment.sh and properties.sh, read and never run (security, reading 9).
+
+Robots source these files, so what they say is taken as text: only assignments of a literal (``export NAME='value'``,
+``"value"`` or a bare word) that the shell would come to on every run are read. Whatever needs a shell to be known is
+left out with a warning: expansions, substitutions, conditions, functions, chained commands. Names that change which
+programs run are left out too, since the variables are handed on to robots.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from app.errors import TooLarge
+
+MAX_BYTES = 2**20
+MAX_VARIABLES = 1000
+MAX_VALUE = 32 * 2**10
+MAX_WARNINGS = 100
+
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}(?![A-Za-z0-9_])")
+_EXPORT = re.compile(r"export(?=[ \t])")
+_BLANK = re.compile(r"[ \t]*")
+_SINGLE = re.compile(r"'([^'\n]*)'")
+_DOUBLE = re.compile(r'"((?:[^"\\$`\n]|\\[^\n])*+)"')
+_BARE = re.compile(r"[^\s'\"\\$`;&|<>(){}*?\[\]~#!\x00-\x1f]+")
+_ESCAPE = re.compile(r"\\([^\n])")
+_ESCAPED = re.compile(r'\\(["\\$`])')
+_NOTHING = re.compile(r"[ \t]*(?:#[^\n]*)?(?:\n|\Z)")
+_END = re.compile(r"(?:[ \t]+#[^\n]*|[ \t]*)(?:\n|\Z)")
+_NEXT = re.compile(r"[ \t]+(?=[A-Za-z_])")
+
+_PIECE = re.compile(
+    r"""
+      '[^']*+(?:'|\Z)                            # quoted text may hold line ends
+    | "(?:[^"\\]|\\.)*+(?:"|\Z)
+    | \\(?:.|\Z)                                 # an escaped character; an escaped line end continues the line
+    | (?<![^\s;&|(){}])\#[^\n]*                  # a comment begins a word
+    | <<-?[ \t]*['"]?(?P<here>[A-Za-z0-9_]+)['"]?
+    | (?P<word>[^\s'"\\;&|(){}<>]+)
+    | (?P<sign>[;&|(){}]|\n)
+    | .
+    """,
+    re.VERBOSE | re.DOTALL,
+)
+_OPENS = frozenset({"if", "case", "for", "while", "until", "select", "{"})
+_CLOSES = frozenset({"fi", "esac", "done", "}"})
+_LEADS = frozenset({"then", "do", "else", "elif", "!", "time"})
+"""Words after which another command begins."""
+
+_DANGEROUS = re.compile(
+    r"PATH|ENV|IFS|SHELL|SHELLOPTS|CDPATH|HOME|USER|LOGNAME|TMPDIR|EDITOR|VISUAL|PAGER|BROWSER|PS[0-4]|PROMPT_COMMAND"
+    r"|(LD|DYLD|BASH|ZSH|GIT|SSH|SUDO|LUA|GCONV|FLEETMAP)_\w*|PYTHON\w*|PERL\w*|RUBY\w*|NODE_(OPTIONS|PATH)"
+    r"|(JAVA|JDK|JAVA_TOOL)_(OPTIONS|OPTS|HOME)|BASHOPTS|_JAVA_OPTIONS|CLASSPATH|MALLOC_\w+|GLIBC_\w+|\w*LIBRARY_PATH|\w*PLUGIN_PATH|\w*PREFIX_PATH"
+    r"|RMW_IMPLEMENTATION|LOCPATH|NLSPATH|\w*_PRELOAD|\w*_PROXY|\w*_proxy"
+)
+"""Names by which whoever sets them decides what a program loads, starts or talks to."""
+
+
+def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
+    """The variables that hold a literal whenever the file is sourced, and what was left out, in words.
+
+    Raises TooLarge beyond 1 MiB, UnicodeDecodeError where the file is no UTF-8.
+    """
+    if len(data) > MAX_BYTES:
+        raise TooLarge(f"a file of shell variables may have {MAX_BYTES} bytes, this one has {len(data)}")
+    text = data.decode("utf-8-sig").replace("\r\n", "\n")
+    known: dict[str, str] = {}
+    warnings: list[str] = []
+    others: list[int] = []
+    told: set[str] = set()
+    at, line, depth = 0, 1, 0
+    while at < len(text):
+        found = _literals(text, at) if depth == 0 else None
+        if found is not None:
+            values, end = found
+            for name, value in values.items():
+                reason = _unfit(name, value, known)
+                if reason:
+                    known.pop(name, None)
+                    warnings.append(f"line {line}: {name} is left out: {reason}")
+                else:
+                    known[name] = value
+        else:
+            end, depth, touched, leaves = _command(text, at, depth)
+            for name in touched:
+                known.pop(name, None)
+                if name not in told:
+                    warnings.append(f"line {line}: {name} is left out: only a shell could say what it is")
+                told.add(name)
+            if not touched:
+                others.append(line)
+            if leaves and end < len(text):
+                warnings.append(f"line {line}: the file ends here, what follows is never reached")
+                break
+        line += text.count("\n", at, end)
+        at = end
+    if others:
+        many = f"{len(others)} commands are" if len(others) > 1 else "a command is"
+        warnings.append(f"line {others[0]}: {many} not an assignment of a literal and left out")
+    if len(warnings) > MAX_WARNINGS:
+        warnings = [*warnings[:MAX_WARNINGS], f"and {len(warnings) - MAX_WARNINGS} more like these"]
+    return known, warnings
+
+
+def exports(values: Mapping[str, str]) -> bytes:
+    """Lines that a shell sources to exactly these values. ValueError for a name or value that must not be handed on."""
+    lines = []
+    for name, value in values.items():
+        reason = "it is not a variable's name" if not _NAME.fullmatch(name) else _unfit(name, value, {})
+        if reason:
+            raise ValueError(f"{name[:80]!r} cannot be exported: {reason}")
+        quoted = value.replace("'", "'\\''")
+        lines.append(f"export {name}='{quoted}'\n")
+    return "".join(lines).encode()
+
+
+def _unfit(name: str, value: str, known: Mapping[str, str]) -> str:
+    """Why this variable is not handed on, or an empty text."""
+    if _DANGEROUS.fullmatch(name):
+        return "the variable decides how programs run"
+    if not all(c.isprintable() for c in value):
+        return "its value has control characters"
+    if len(value) > MAX_VALUE:
+        return f"its value has more than {MAX_VALUE} characters"
+    if len(known) >= MAX_VARIABLES and name not in known:
+        return f"the file has more than {MAX_VARIABLES} variables"
+    return ""
+
+
+def _literals(text: str, at: int) -> tuple[dict[str, str], int] | None:
+    """The assignments of a line that holds nothing else, and where the next begins; None for any other line."""
+    if nothing := _NOTHING.match(text, at):
+        return {}, nothing.end()
+    at = _past(_BLANK, text, at)
+    exported = _EXPORT.match(text, at)
+    if exported:
+        at = _past(_BLANK, text, exported.end())
+    values: dict[str, str] = {}
+    while name := _NAME.match(text, at):
+        at = name.end()
+        if text[at : at + 1] == "=":
+            values[name.group()], at = _value(text, at + 1)
+        elif not exported:  # export of a name alone is of a variable that stands elsewhere
+            return None
+        if end := _END.match(text, at):
+            return values, end.end()
+        following = _NEXT.match(text, at)
+        if following is None:
+            return None
+        at = following.end()
+    return None
+
+
+def _value(text: str, at: int) -> tuple[str, int]:
+    """Quoted and bare pieces that stand together; ends where something else begins."""
+    parts = []
+    while at < len(text):
+        if piece := _SINGLE.match(text, at):
+            parts.append(piece.group(1))
+        elif piece := _DOUBLE.match(text, at):
+            parts.append(_ESCAPED.sub(r"\1", piece.group(1)))
+        elif piece := _BARE.match(text, at):
+            parts.append(piece.group())
+        elif piece := _ESCAPE.match(text, at):
+            parts.append(piece.group(1))
+        else:
+            break
+        at = piece.end()
+    return "".join(parts), at
+
+
+def _command(text: str, at: int, depth: int) -> tuple[int, int, list[str], bool]:
+    """Pass over a logical line: its end, the depth of blocks behind it, the variables it may set, whether it leaves."""
+    touched: dict[str, None] = {}
+    heres: list[str] = []
+    begins, leaves, first = True, False, ""
+    while at < len(text):
+        piece = _PIECE.match(text, at)
+        if piece is None:  # every character matches the last alternative
+            break
+        at = piece.end()
+        word, sign = piece["word"], piece["sign"]
+        if piece["here"]:
+            heres.append(piece["here"])
+        if sign in ("{", "}") and begins:
+            word = sign
+        if word:
+            assigned = _NAME.match(word)
+            if assigned and word[assigned.end() : assigned.end() + 2].startswith(("=", "+=", "[")):
+                touched[assigned.group()] = None
+            elif assigned and assigned.end() == len(word) and first in ("unset", "read", "readarray", "mapfile", "for"):
+                touched[word] = None
+            if begins:
+                leaves = leaves or (depth == 0 and word in ("return", "exit", "exec"))
+                depth += (word in _OPENS) - (word in _CLOSES)
+                first = word
+            begins = (begins and word in _LEADS | {"{"}) or word in ("then", "do", "else")
+        elif sign == "\n":
+            break
+        elif sign:
+            begins = True
+        elif piece.group().strip() and not piece.group().startswith("#"):
+            begins = False
+    for end in heres:
+        found = re.compile(rf"^\t*{re.escape(end)}$", re.MULTILINE).search(text, at)
+        at = len(text) if found is None else min(len(text), found.end() + 1)
+    return at, max(depth, 0), list(touched), leaves
+
+
+def _past(pattern: re.Pattern[str], text: str, at: int) -> int:
+    found = pattern.match(text, at)
+    return found.end() if found else at

@@ -1,0 +1,245 @@
+"""Shell variables: the literals that a real shell would end with, nothing that needs one, and bounded effort."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from app.errors import TooLarge
+from app.formats import _shell
+
+TEMPLATE = b"""#!/bin/bash
+# HEADER: export HIDDEN='no'
+__filename=$(realpath "${BASH_SOURCE:-$0}")
+__dirname=$(dirname "$__filename")
+
+export COMMON_RELEASE='v1.0.1'
+if [ -f "$__dirname/properties.sh" ] ; then
+  source "$__dirname/properties.sh"
+  export PROPERTIES_FILE='set'
+fi
+if [[ -f $__dirname/location/datum.yaml ]]; then
+    export DATUM_FILE="$__dirname/location/datum.yaml"
+else
+    export DATUM_FILE="$__dirname/location/datum_autogen.yaml"
+fi
+for f in a b; do export LOOPED=$f; done
+show () {
+  export INSIDE='function'
+}
+case "$1" in
+  a) export CASED='a' ;;
+esac
+export FIELD_NAME="east \\"path\\""  # a comment
+export FIELD_ID=p1
+"""
+
+
+def values(text: str | bytes) -> dict[str, str]:
+    return _shell.assignments(text.encode() if isinstance(text, str) else text)[0]
+
+
+def test_only_what_is_literal_on_every_run() -> None:
+    known, warnings = _shell.assignments(TEMPLATE)
+    assert known == {"COMMON_RELEASE": "v1.0.1", "FIELD_NAME": 'east "path"', "FIELD_ID": "p1"}
+    said = "\n".join(warnings)
+    for name in ("DATUM_FILE", "LOOPED", "INSIDE", "CASED", "PROPERTIES_FILE", "__dirname"):
+        assert f"{name} is left out" in said
+    assert "line 9: PROPERTIES_FILE" in said
+    assert "HIDDEN" not in said
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("export A='x y'", {"A": "x y"}),
+        ('export A="x y"\n', {"A": "x y"}),
+        ("A=x", {"A": "x"}),
+        ("  export\tA=x  # said\nB=y", {"A": "x", "B": "y"}),
+        ("export A=1 B='2 3' C", {"A": "1", "B": "2 3"}),
+        ("export A='it'\\''s'", {"A": "it's"}),
+        ("A=a\\ b\\$c", {"A": "a b$c"}),
+        ("A=a\\", {}),
+        ("export A='a'\"b\"c", {"A": "abc"}),
+        ("export A=''", {"A": ""}),
+        ("export A=", {"A": ""}),
+        ("export A=https://example.org/a,b", {"A": "https://example.org/a,b"}),
+        ("export A='$HOME `id` $(id)'", {"A": "$HOME `id` $(id)"}),
+        ('export A="\\$5 \\\\ \\x"', {"A": "$5 \\ \\x"}),
+        ("export A='größer'", {"A": "größer"}),
+        ("export A='1'\r\nexport B='2'\r\n", {"A": "1", "B": "2"}),
+        ("\ufeffexport A=1", {"A": "1"}),
+        ("A=1\nA=2", {"A": "2"}),
+        ("A=1\nA=$B", {}),
+        ("A=1\nA+=2", {}),
+        ("A=1\nunset A", {}),
+        ("A=1\nread A", {}),
+        ("A=1\nif true; then A=2; fi", {}),
+        ("A=$(id)", {}),
+        ("A=`id`", {}),
+        ('A="$(id)"', {}),
+        ("A=1; id", {}),
+        ("A=1 id", {}),
+        ("A=1 && B=2", {}),
+        ("A=~/x", {}),
+        ("A=1#x", {}),
+        ("A=a*", {}),
+        ("A=(1 2)", {}),
+        ("A=<(id)", {}),
+        ("A='1", {}),
+        ("A='1\nB=2\n'\nC=3", {"C": "3"}),
+        ("cat <<EOF\nA=1\nEOF\nB=2", {"B": "2"}),
+        ("cat <<-'EOF'\nA=1\n\tEOF\nB=2", {"B": "2"}),
+        ("echo \\\nA=1\nB=2", {"B": "2"}),
+        ("f() {\nA=1\n}\nB=2", {"B": "2"}),
+        ("f()\n{\nA=1\n}\nB=2", {"B": "2"}),
+        ("A=1\nreturn\nB=2", {"A": "1"}),
+        ("A=1\n[ -z $X ] && exit\nB=2", {"A": "1"}),
+        ("if true; then\n if true; then\n A=1\n fi\n B=2\nfi\nC=3", {"C": "3"}),
+        ("while read x; do\nA=1\ndone\nB=2", {"B": "2"}),
+        ("echo 'if'\nA=1", {"A": "1"}),
+        ("echo if then # if\nA=1", {"A": "1"}),
+        ("1A=x\nA-B=x\nA =x\nA= x", {}),
+        ("export A='\x07'", {}),
+        ("export LD_PRELOAD='/tmp/x.so'\nexport PATH='/tmp'\nexport BASH_ENV=x\nexport A=1", {"A": "1"}),
+        ("export GZ_SIM_SYSTEM_PLUGIN_PATH='/x'\nexport PYTHONSTARTUP='/x'\nexport https_proxy=x", {}),
+        (
+            "export ENVIRONMENT='e'\nexport NODE_NAME='n'\nexport PATHWAY='p'",
+            {"ENVIRONMENT": "e", "NODE_NAME": "n", "PATHWAY": "p"},
+        ),
+        ("", {}),
+        ("\n\n# nothing\n", {}),
+    ],
+)
+def test_lines(text: str, expected: dict[str, str]) -> None:
+    known, warnings = _shell.assignments(text.encode())
+    assert known == expected
+    assert all("line" in w for w in warnings)
+
+
+@pytest.mark.parametrize(
+    "text", [t for (t,) in [(m,) for m in ("A=$(id)", "A=1; id", "id", "A='\x1b'", "PATH=x", "return\nA=1")]]
+)
+def test_what_is_left_out_is_told(text: str) -> None:
+    assert _shell.assignments(text.encode())[1]
+
+
+def test_literals_alone_need_no_warning() -> None:
+    assert _shell.assignments(b"#!/bin/sh\n\nexport A='1'\nexport B=\"2\" # two\n")[1] == []
+
+
+def test_real_property_files(shared: Path, facts_json: dict[str, Any]) -> None:
+    known = {n: f for n, f in facts_json.items() if f["kind"] == "environment_variables"}
+    assert len(known) == 3
+    for name, entry in known.items():
+        read, warnings = _shell.assignments((shared / "data" / name).read_bytes())
+        assert read == entry["facts"]["literal_assignments"], name
+        assert warnings == []
+
+
+def test_bounds() -> None:
+    with pytest.raises(TooLarge):
+        _shell.assignments(b"#" * (_shell.MAX_BYTES + 1))
+    with pytest.raises(UnicodeDecodeError):
+        _shell.assignments(b"A='\xff'")
+    many = "".join(f"A{i}=1\n" for i in range(3000))
+    known, warnings = _shell.assignments(many.encode())
+    assert len(known) == _shell.MAX_VARIABLES
+    assert len(warnings) == _shell.MAX_WARNINGS + 1
+    assert values(f"A={'x' * (_shell.MAX_VALUE + 1)}") == {}
+
+
+HOSTILE = [
+    "<<a ",
+    "A=1 ",
+    "'",
+    '"',
+    "\\",
+    "{\n",
+    "if ",
+    "A='x'\"y\"",
+    "<<a\na\n",
+    "$(",
+    "export A=1;",
+    "#",
+    "A=",
+    "\n",
+    "  ",
+]
+
+
+@pytest.mark.parametrize("piece", HOSTILE)
+def test_hostile_repetition_is_quick(piece: str) -> None:
+    started = time.perf_counter()
+    _shell.assignments((piece * (2**20 // len(piece))).encode())
+    assert time.perf_counter() - started < 20  # a quadratic scan of a mebibyte takes hours
+
+
+@given(st.binary(max_size=200))
+@settings(max_examples=300, deadline=None)
+def test_any_bytes(data: bytes) -> None:
+    try:
+        known, _ = _shell.assignments(data)
+    except UnicodeDecodeError:
+        return
+    assert all(name.isidentifier() for name in known)
+
+
+PIECES = ["A=", "B=", "C", "export ", "'", '"', "\\", "$x", "`", ";", " ", "\n", "#", "x", "1", "é", "\t"]
+PIECES += ["if true\n", "then ", "fi\n", "{ ", "}\n"]
+BASH = shutil.which("bash") or ""
+
+
+@pytest.mark.skipif(not BASH, reason="bash is absent")
+def test_a_real_shell_ends_with_the_same_values(tmp_path: Path) -> None:
+    """What is read of random scripts is what bash ends with (these pieces make no command that could do harm)."""
+    dice, checked = random.Random(3), 0
+    scripts = ["".join(dice.choice(PIECES) for _ in range(dice.randrange(2, 14))) for _ in range(4000)]
+    scripts = [s for s in scripts if values(s)]
+    report = 'printf \'%s\\0\' "${A-unset}" "${B-unset}"\n'
+    for number, script in enumerate(scripts[:250]):
+        file = tmp_path / f"{number}.sh"
+        file.write_text(script)
+        shell = [BASH, "--norc", "-c", f". {file} >/dev/null 2>&1; {report}"]
+        ran = subprocess.run(shell, capture_output=True, check=False, env={"LC_ALL": "C.UTF-8", "PATH": "/nonexistent"})
+        a, b, *_ = ran.stdout.decode("utf-8", "replace").split("\0")
+        for name, value in values(script).items():
+            if name in "AB" and {"A": a, "B": b}[name] != "unset":
+                assert {"A": a, "B": b}[name] == value, script
+                checked += 1
+    assert checked > 100
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(["A", "B_1", "FIELD_NAME"]), st.text(st.characters(categories=["L", "N", "P", "S", "Zs"]))
+    )
+)
+@settings(deadline=None)
+def test_exports_read_back(wanted: dict[str, str]) -> None:
+    text = {name: value for name, value in wanted.items() if value.isprintable()}
+    assert _shell.assignments(_shell.exports(text)) == (text, [])
+
+
+@pytest.mark.skipif(not BASH, reason="bash is absent")
+def test_exports_are_what_a_shell_reads() -> None:
+    value = 'it\'s $HOME `id` "x" \\ ; é #'
+    script = _shell.exports({"A": value}).decode() + 'printf %s "$A"'
+    ran = subprocess.run([BASH, "--norc", "-c", script], capture_output=True, check=True)
+    assert ran.stdout.decode() == value
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("A;id", "1"), ("1A", "x"), ("", "x"), ("A", "x\ny"), ("PATH", "x"), ("A\n", "x")]
+)
+def test_exports_refuses(name: str, value: str) -> None:
+    with pytest.raises(ValueError, match="cannot be exported"):
+        _shell.exports({name: value})
