@@ -1,0 +1,127 @@
+"""Worker processes: results, errors, crashes, overruns, and the end with the parent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from app.errors import NotFound, Problem, TooLarge, Unavailable
+from app.pool import Pool, WorkerDied
+
+
+def work_double(x: int) -> int:
+    return 2 * x
+
+
+def work_refuse() -> None:
+    raise NotFound("nothing here", [Problem("gone", "a.yaml", 3)])
+
+
+def work_bug() -> None:
+    {}["missing"]  # noqa: B018
+
+
+def work_crash() -> None:
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def work_sleep(seconds: float) -> int:
+    time.sleep(seconds)
+    return os.getpid()
+
+
+def work_eat() -> int:
+    return len(bytearray(64 * 2**30))
+
+
+@pytest.fixture
+def pool() -> Iterator[Pool]:
+    made = Pool(1, memory_bytes=4 * 2**30, seconds=20.0, waiting=1)
+    yield made
+    made.close()
+
+
+def test_a_result_comes_back(pool: Pool) -> None:
+    assert pool.run(work_double, 21) == 42
+
+
+def test_our_errors_keep_their_class_and_places(pool: Pool) -> None:
+    with pytest.raises(NotFound) as caught:
+        pool.run(work_refuse)
+    assert caught.value.problems == (Problem("gone", "a.yaml", 3),)
+
+
+def test_a_bug_is_told_with_its_trace(pool: Pool) -> None:
+    with pytest.raises(RuntimeError, match="KeyError in a worker"):
+        pool.run(work_bug)
+
+
+def test_a_crash_costs_one_job_and_a_fresh_worker_goes_on(pool: Pool) -> None:
+    with pytest.raises(WorkerDied, match="damaged or too large"):
+        pool.run(work_crash)
+    assert pool.run(work_double, 1) == 2
+
+
+def test_an_overrun_is_stopped_and_a_fresh_worker_goes_on(pool: Pool) -> None:
+    pool.run(work_double, 1)
+    start = time.monotonic()
+    with pytest.raises(WorkerDied, match=r"longer than 0\.3 seconds"):
+        pool.run(work_sleep, 60.0, seconds=0.3)
+    assert time.monotonic() - start < 10.0
+    assert pool.run(work_double, 1) == 2
+
+
+def test_memory_is_limited_and_the_worker_survives(pool: Pool) -> None:
+    with pytest.raises(TooLarge):
+        pool.run(work_eat)
+    assert pool.run(work_double, 1) == 2
+
+
+def test_who_is_too_many_is_told_to_come_again(pool: Pool) -> None:
+    pool.run(work_double, 1)
+    threads = [threading.Thread(target=pool.run, args=(work_sleep, 1.0)) for _ in range(2)]
+    for t in threads:
+        t.start()
+    time.sleep(0.3)
+    with pytest.raises(Unavailable, match="try again"):
+        pool.run(work_double, 1)
+    for t in threads:
+        t.join()
+    assert pool.run(work_double, 1) == 2
+
+
+def test_a_worker_ends_with_a_killed_parent(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import os, signal, sys\n"
+        "from app.pool import Pool\n"
+        "from tests.test_pool import work_sleep\n"
+        "if __name__ == '__main__':\n"
+        "    pool = Pool(1)\n"
+        "    print(pool.run(work_sleep, 0.0), flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    root = Path(__file__).resolve().parents[1]
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(root)}
+    )
+    worker = int(done.stdout)
+    for _ in range(100):
+        try:
+            os.kill(worker, 0)
+        except ProcessLookupError:
+            return
+        if Path(f"/proc/{worker}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+            return  # ended; whoever adopted it has not yet looked
+        time.sleep(0.1)
+    pytest.fail("the worker outlived its parent")
+
+
