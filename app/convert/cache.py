@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
-import logging
 import os
 import shutil
 import threading
@@ -21,8 +20,6 @@ from typing import Any
 from uuid import uuid4
 
 import orjson
-
-log = logging.getLogger(__name__)
 
 FRESH_SECONDS = 60.0
 """A map is marked as used at most this often: its age decides what goes when room is needed."""
@@ -65,18 +62,24 @@ class Product:
     report: dict[str, Any]
 
 
+ABANDONED_SECONDS = 3600.0
+"""A map in the making that nobody touched for so long was left by a killed process."""
+
+
 class Cache:
     """At most ``limit`` bytes of made maps; the longest unused go first."""
 
     def __init__(self, folder: Path, limit: int) -> None:
         self._folder, self._limit = folder, limit
-        self._known: dict[str, Made] = {}
         self._locks: dict[str, threading.Lock] = {}
         self._guard = threading.Lock()
         self.hits = self.misses = 0
         (folder / "locks").mkdir(parents=True, exist_ok=True)
-        for old in folder.glob("making-*"):  # left by a killed process
-            shutil.rmtree(old, ignore_errors=True)
+        for old in folder.glob("making-*"):
+            with contextlib.suppress(OSError):
+                if time.time() - old.stat().st_mtime > ABANDONED_SECONDS:
+                    shutil.rmtree(old, ignore_errors=True)
+        self._total = sum(size for _, size, _ in self._entries())
 
     def get(self, key: str) -> Made | None:
         """The map, if it is made."""
@@ -119,24 +122,32 @@ class Cache:
                 making.rename(target)
         finally:
             shutil.rmtree(making, ignore_errors=True)
-        self._make_room()
         made = self.get(key)
         if made is None:
             raise OSError(f"the cache folder {self._folder} does not keep what is written to it")
+        self._total += sum(f.size for f in made.files) + (made.archive.size if made.archive else 0)
+        if self._total > self._limit:
+            self._make_room()
         return made
 
     def _make_room(self) -> None:
-        entries = []
-        for folder in self._folder.glob("[0-9a-f][0-9a-f]/*"):
-            with contextlib.suppress(OSError):
-                size = sum(f.stat().st_size for f in folder.iterdir())
-                entries.append((folder.stat().st_mtime, size, folder))
+        """Called when there is too much; other processes may be doing the same, which does no harm."""
+        entries = sorted(self._entries())
         total = sum(size for _, size, _ in entries)
-        for _, size, folder in sorted(entries)[:-1]:  # the newest stays, whatever its size
+        for _, size, folder in entries[:-1]:  # the newest stays, whatever its size
             if total <= self._limit:
                 break
             shutil.rmtree(folder, ignore_errors=True)
             total -= size
+        self._total = total
+
+    def _entries(self) -> list[tuple[float, int, Path]]:
+        """Each made map: when it was last used, its size, its folder."""
+        out = []
+        for folder in self._folder.glob("[0-9a-f][0-9a-f]/*"):
+            with contextlib.suppress(OSError):
+                out.append((folder.stat().st_mtime, sum(f.stat().st_size for f in folder.iterdir()), folder))
+        return out
 
     @contextlib.contextmanager
     def _only(self, key: str) -> Iterator[None]:
