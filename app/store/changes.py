@@ -10,8 +10,22 @@ from typing import Any, Final, Literal
 from app.model.features import Features
 from app.model.frame import Datum, Level
 from app.model.layers import Part, PartKey
-from app.store.values import PartEntry
-from app.store.values import Provenance as Provenance
+from app.store.values import PartEntry, Provenance
+
+__all__ = [
+    "KEEP",
+    "RAW",
+    "Changes",
+    "Delete",
+    "Drop",
+    "IndexRows",
+    "Keep",
+    "Operation",
+    "Prepared",
+    "Provenance",
+    "Put",
+    "Replace",
+]
 
 
 class Keep(enum.Enum):
