@@ -53,7 +53,7 @@ class OccupancyGrid:
                 raise Invalid(f"{name} must be between 0 and 1, got {value!r}")
         if self.mode not in ("trinary", "scale", "raw"):
             raise Invalid(f"mode must be trinary, scale or raw, got {self.mode!r}")
-        if bool(((self.cells > OCCUPIED) & (self.cells != UNKNOWN)).any()):
+        if _beyond(self.cells):
             raise Invalid("cells must be 0 to 100, or 255 for unknown")
         self.cells.flags.writeable = False
 
@@ -76,7 +76,13 @@ class OccupancyGrid:
 
     def counts(self) -> dict[str, int]:
         """How many cells are occupied (100), free (0), unknown, and anything else."""
-        n = np.bincount(self.cells.ravel(), minlength=256)
-        occupied, free, unknown = int(n[OCCUPIED]), int(n[FREE]), int(n[UNKNOWN])
+        occupied, free, unknown = (int(np.count_nonzero(self.cells == v)) for v in (OCCUPIED, FREE, UNKNOWN))
         other = int(self.cells.size) - occupied - free - unknown
         return {"occupied": occupied, "free": free, "unknown": unknown, "other": other}
+
+
+def _beyond(cells: NDArray[np.uint8]) -> bool:
+    """Whether any cell is neither 0…100 nor 255, a strip of rows at a time: every grid passes here."""
+    rows = max(1, 2**18 // cells.shape[1])
+    shift = np.uint8(256 - UNKNOWN)  # in uint8 arithmetic 255 becomes 0, and 0…100 become 1…101
+    return any(int((cells[y : y + rows] + shift).max()) > OCCUPIED + int(shift) for y in range(0, len(cells), rows))
