@@ -1,0 +1,53 @@
+# `make run` serves, `make test` tests: both create what they need (a virtual environment in .venv, from uv.lock).
+# Needed on the machine: Python 3.11 or newer, and the network for the packages of the lock file.
+
+PYTHON ?= python3
+VENV ?= .venv
+UV_VERSION := 0.13.8
+BIN := $(VENV)/bin
+ARGS ?=
+
+# uv installs the lock file in seconds; where it is absent it is put into the virtual environment first.
+UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo $(BIN)/uv)
+SYNC := UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen --inexact --quiet --no-python-downloads
+
+.PHONY: run test lint bench install install-dev clean
+
+run: install
+	@$(BIN)/fleetmap serve --demo $(ARGS)
+
+test: install-dev
+	@$(BIN)/python -m pytest -n auto $(ARGS)
+
+lint: install-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) lock --check --no-python-downloads
+
+bench: install-dev
+	@$(BIN)/python -m tests.bench $(ARGS)
+
+install: $(VENV)/.installed
+
+install-dev: $(VENV)/.installed-dev
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed: make PYTHON=/path/to/it" if sys.version_info < (3, 11) else 0)'
+	@echo "creating $(VENV) ..."
+	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo "this Python has no venv module (Debian: apt install python3-venv)"; exit 1; }
+	@test "$(UV)" = uv || $(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
+
+$(VENV)/.installed: pyproject.toml uv.lock | $(BIN)/python
+	@echo "installing the packages of uv.lock ..."
+	@$(SYNC) --no-dev
+	@touch $@
+
+$(VENV)/.installed-dev: pyproject.toml uv.lock | $(BIN)/python
+	@echo "installing the packages of uv.lock ..."
+	@$(SYNC)
+	@touch $@ $(VENV)/.installed
+
+clean:
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

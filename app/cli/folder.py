@@ -1,0 +1,115 @@
+"""Which files of a folder make an environment, and what it is called.
+
+An environment_template folder, as it is found in the wild, is a ROS package with ``config/location``,
+``config/metric``, ``config/topological`` and ``config/world``; the user gives the package, or its ``config``. Any
+other folder is taken as it is. Names keep their folders, since the server decides by them what a file is meant for.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from app.cli.client import LocalFile
+from app.errors import Invalid
+
+CONFIG = "config"
+PARTS = ("location", "metric", "topological", "world")
+"""The folders of an environment_template's config."""
+
+SCRIPTS = ("environment.sh", "properties.sh")
+"""Read as literal assignments by the server; never run."""
+
+SKIPPED = frozenset({".git", ".svn", ".hg", "__pycache__", "node_modules", ".DS_Store"})
+
+RESERVED = frozenset({"robots", "server"})
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
+
+
+@dataclass(frozen=True, slots=True)
+class Folder:
+    """Files to upload. root: what the names are relative to. notes: what was left out, and why."""
+
+    root: Path
+    files: tuple[LocalFile, ...]
+    is_template: bool
+    notes: tuple[str, ...]
+
+
+def collect(folder: Path) -> Folder:
+    """All files of a folder that belong to its environment, sorted by name.
+
+    Of an environment_template only ``config`` and the scripts beside it are taken: the rest of the package is no map.
+    Invalid where there is nothing to upload.
+    """
+    folder = folder.resolve()
+    root, wanted = _template(folder)
+    notes: list[str] = []
+    files = [_local(path, root) for path in _walk(wanted or root, root, notes)]
+    if wanted is not None:
+        files += [_local(root / name, root) for name in SCRIPTS if (root / name).is_file()]
+    if not files:
+        raise Invalid(f"{folder} has no files to upload")
+    return Folder(root, tuple(sorted(files, key=lambda f: f.name)), wanted is not None, tuple(notes))
+
+
+def environment_name(text: str) -> str:
+    """A valid environment name made from a folder's: ``Farm North (2)`` becomes ``farm-north-2``.
+
+    Invalid where nothing is left or the name is reserved.
+    """
+    name = re.sub(r"[^a-z0-9_-]+", "-", text.lower()).strip("-_")[:63].rstrip("-_")
+    if not NAME.fullmatch(name) or name in RESERVED:
+        raise Invalid(f"{text!r} makes no name for an environment: give one with --environment")
+    return name
+
+
+def single(path: Path, name: str | None = None) -> LocalFile:
+    """One file by its own name."""
+    return LocalFile(name or path.name, path, path.stat().st_size)
+
+
+def _template(folder: Path) -> tuple[Path, Path | None]:
+    """What names are relative to, and the config folder; None where this is no environment_template."""
+    if _is_config(folder / CONFIG):
+        return folder, folder / CONFIG
+    if folder.name == CONFIG and _is_config(folder):
+        return folder.parent, folder
+    return folder, None
+
+
+def _is_config(folder: Path) -> bool:
+    return folder.is_dir() and any((folder / part).is_dir() for part in PARTS)
+
+
+def _walk(folder: Path, root: Path, notes: list[str]) -> Iterator[Path]:
+    """Regular files below a folder. Links are followed only while they stay inside ``root``."""
+    for entry in sorted(folder.iterdir()):
+        if entry.name in SKIPPED:
+            continue
+        name = entry.relative_to(root).as_posix()
+        if entry.is_symlink():
+            target = entry.resolve()
+            if not target.is_relative_to(root) or target.is_dir():
+                notes.append(f"{name}: a link out of the folder or to a folder is not followed")
+                continue
+        try:
+            mode = os.stat(entry).st_mode  # noqa: PTH116  one call tells what it is
+        except OSError as error:
+            notes.append(f"{name}: {error.strerror or error}")
+            continue
+        if stat.S_ISDIR(mode):
+            yield from _walk(entry, root, notes)
+        elif stat.S_ISREG(mode):
+            yield entry
+        else:
+            notes.append(f"{name}: neither a file nor a folder")
+
+
+def _local(path: Path, root: Path) -> LocalFile:
+    return single(path, path.relative_to(root).as_posix())

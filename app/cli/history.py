@@ -1,0 +1,160 @@
+"""The history of an environment: versions, diff, promote, revert."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import typer
+
+from app.cli import options, output
+from app.cli.client import Client, path_of
+
+Environment = Annotated[str, typer.Argument(help="Name of the environment.")]
+
+
+def versions(
+    environment: Environment,
+    limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="How many, newest first.")] = 20,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """The history of an environment, newest first, with the channels that stand on each version."""
+    with Client(server, token) as client:
+        page = {"limit": min(limit, 100)}
+        rows = list(client.pages(path_of("environments", environment, "versions"), page, limit=limit))
+        standing = channels_by_version(client, environment)
+    if as_json:
+        output.show_json(rows)
+        return
+    output.show_table(
+        ("version", "channels", "time", "author", "message", "changes"),
+        (
+            (
+                row["version"],
+                ", ".join(standing.get(row["version"], ())),
+                row.get("time"),
+                row.get("author"),
+                row.get("message"),
+                summary(row.get("changes") or {}),
+            )
+            for row in rows
+        ),
+    )
+
+
+def diff(
+    environment: Environment,
+    old: Annotated[str, typer.Argument(metavar="FROM", help="Version number or channel.")],
+    new: Annotated[str, typer.Argument(metavar="TO", help="Version number or channel.")] = "latest",
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """What differs between two versions, item by item."""
+    with Client(server, token) as client:
+        told = client.get(path_of("environments", environment, "diff"), {"from": old, "to": new})
+    if as_json:
+        output.show_json(told)
+        return
+    layers = told.get("layers") or {}
+    lines = 0
+    for layer, change in layers.items():
+        for line in _lines(layer, change):
+            output.show(line)
+            lines += 1
+    if "datum" in told:
+        output.show(f"datum: {told['datum']}")
+        lines += 1
+    if not lines:
+        output.show(f"versions {told.get('from', old)} and {told.get('to', new)} hold the same")
+
+
+def promote(
+    environment: Environment,
+    version: Annotated[
+        str, typer.Argument(help="Version number or channel that the channel is to stand on.")
+    ] = "latest",
+    channel: Annotated[str, typer.Option("--channel", "-c", help="The channel to move.")] = "production",
+    at: Annotated[str | None, typer.Option("--at", metavar="TIME", help="Activate then (RFC 3339), not now.")] = None,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Move a channel to a version: forward to roll out, back to roll back."""
+    with Client(server, token) as client:
+        number = resolve(client, environment, version)
+        body = {"version": number, "activate_at": at}
+        moved = client.put(path_of("environments", environment, "channels", channel), body)
+    if as_json:
+        output.show_json(moved)
+    elif at:
+        output.show(f"{environment}: {channel} will stand on version {number} at {at}")
+    else:
+        output.show(f"{environment}: {channel} stands on version {number}")
+
+
+def revert(
+    environment: Environment,
+    version: Annotated[str, typer.Argument(help="Version number or channel whose content is wanted back.")],
+    message: options.Message = "",
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Make a new version with the content of an old one. Nothing is deleted."""
+    with Client(server, token) as client:
+        number = resolve(client, environment, version)
+        body = {"revert_to": number, "message": message or f"revert to version {number}"}
+        made = client.post(path_of("environments", environment, "versions"), body, repeat=True)
+    if as_json:
+        output.show_json(made)
+    else:
+        output.show(f"{environment}: version {made['version']} holds what version {number} holds")
+
+
+def resolve(client: Client, environment: str, version: str) -> int:
+    """The number that a channel's name stands for; Refused where there is none."""
+    if version.isascii() and version.isdigit():
+        return int(version)
+    number: int = client.get(path_of("environments", environment, "versions", version))["version"]
+    return number
+
+
+def channels_by_version(client: Client, environment: str) -> dict[int, list[str]]:
+    """Which channels stand on which version."""
+    told: dict[int, list[str]] = {}
+    for row in channel_rows(client, environment):
+        told.setdefault(row["version"], []).append(str(row["channel"]))
+    return told
+
+
+def channel_rows(client: Client, environment: str) -> list[dict[str, Any]]:
+    """All channels of an environment."""
+    rows: list[dict[str, Any]] = client.get(path_of("environments", environment, "channels"))
+    return rows
+
+
+def summary(changes: Mapping[str, Any]) -> str:
+    """A version's changes in a few words."""
+    return "; ".join(f"{what}: {counts(change)}" for what, change in changes.items())
+
+
+def counts(change: Any) -> str:
+    """Counts of one change in a few words: ``2 added, 1 deleted``."""
+    if not isinstance(change, Mapping):
+        return str(change)
+    parts = [f"{k} ({counts(v)})" if isinstance(v, Mapping) else f"{v} {k}" for k, v in change.items() if v]
+    return ", ".join(parts) or "unchanged"
+
+
+def _lines(layer: str, change: Mapping[str, Any]) -> list[str]:
+    """A layer's differences: of features by id, of grids by name with the cells counted."""
+    if not any(isinstance(change.get(kind), list) for kind in ("added", "changed", "deleted")):
+        return [f"~ {layer} {name}: {counts(grid)}" for name, grid in change.items() if grid]
+    lines = [f"+ {layer} {item}" for item in change.get("added", [])]
+    for item in change.get("changed", []):
+        fields = ", ".join(item.get("fields") or ())
+        lines.append(f"~ {layer} {item['id']}{f': {fields}' if fields else ''}")
+    return lines + [f"- {layer} {item}" for item in change.get("deleted", [])]

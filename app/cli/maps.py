@@ -1,0 +1,334 @@
+"""Maps in and out: import, export, convert, formats, coverage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from app.cli import folder as folders
+from app.cli import options, output, write
+from app.cli.client import Client, Download, LocalFile, Refused, path_of
+from app.cli.history import channel_rows, counts
+from app.errors import Invalid, NotFound
+from app.model.frame import GROUND, Datum
+
+LAYERS = ("location", "objects", "topology", "occupancy", "voxels", "imagery", "zones")
+
+
+def import_maps(
+    paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="An environment's folder, or map files.")],
+    environment: Annotated[
+        str | None,
+        typer.Option("--environment", "-e", help="Name [default: made from the folder's]; created where it is absent."),
+    ] = None,
+    format: options.Format = None,
+    layer: options.Layer = None,
+    level: options.Level = GROUND,
+    grid: options.Grid = None,
+    mode: Annotated[
+        str, typer.Option("--mode", help="replace: a map replaces its like; merge: nothing is deleted.")
+    ] = "replace",
+    message: options.Message = "",
+    datum: options.DatumText = None,
+    option: options.Options = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Tell what would change; store nothing.")] = False,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Upload a folder or files as one version of an environment.
+
+    A folder with config/location, config/metric, config/topological or config/world is an environment_template: its
+    files are taken with their folders, which say what each of them is meant for.
+    """
+    where = options.datum(datum)
+    extra = options.pairs(option)
+    files, suggested, notes = _collect(paths)
+    name = environment or suggested
+    if name is None:
+        raise typer.BadParameter("files need --environment NAME; a folder would give its own name")
+    fields = {"level": level, "mode": mode, "message": message or _default_message(paths)} | extra
+    fields |= {k: v for k, v in (("format", format), ("layer", layer), ("grid", grid)) if v is not None}
+    fields |= {"dry_run": "true"} if dry_run else {}
+    with Client(server, token) as client:
+        made = _ensure(client, name, paths, where, dry_run=dry_run)
+        try:
+            status, body = client.upload(path_of("environments", name, "versions"), files, fields)
+        except Refused as refused:
+            if made:
+                refused.hint = f"{refused.hint}\nThe environment {name} was created and is empty.".strip()
+            raise
+    if as_json:
+        output.show_json(body)
+        return
+    for note in notes:
+        output.say(f"left out: {note}", style="yellow")
+    _show_import(name, status, body, dry_run=dry_run, made=made)
+
+
+def export_map(
+    environment: Annotated[str, typer.Argument(help="Name of the environment.")],
+    format: Annotated[str, typer.Argument(help="Format wanted; `fleetmap formats` lists them.")],
+    to: options.Output = None,
+    version: Annotated[
+        str | None,
+        typer.Option("--version", "-V", help="Number or channel [default: production if there is one, else latest]."),
+    ] = None,
+    file: Annotated[str | None, typer.Option("--file", help="Only this file of the map.")] = None,
+    option: options.Options = None,
+    derive: Annotated[bool, typer.Option("--derive/--no-derive", help="Derive layers that no source has told.")] = True,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Get a map in any format that its layers give, and tell what was derived, filled in or dropped.
+
+    A map of several files becomes a folder where -o names one, else a ZIP. Without -o it is written here, under the
+    server's name for it.
+    """
+    if to == "-" and as_json:
+        raise typer.BadParameter("--json and -o - both want standard output")
+    params: dict[str, str] = options.pairs(option)
+    params |= {} if derive else {"derive": "false"}
+    with Client(server, token) as client:
+        chosen = version or _preferred(client, environment)
+        base = path_of("environments", environment, "versions", chosen)
+        with client.download(base + path_of("maps", format, *([file] if file else [])), params) as got:
+            written = _store(got, to)
+        report = client.get(base + path_of("reports", format), params)
+    if as_json:
+        output.show_json({"files": written, "report": report})
+        return
+    for name in written:
+        output.say(f"wrote {name}")
+    show_report(report)
+
+
+def convert(
+    paths: Annotated[list[Path], typer.Argument(metavar="IN...", help="Map files, or a folder.", exists=True)],
+    to: Annotated[str, typer.Option("--to", help="Format wanted; `fleetmap formats` lists them.")],
+    out: Annotated[str, typer.Option("--output", "-o", help="A file, a folder, or - for standard output.")],
+    format: options.Format = None,
+    layer: options.Layer = None,
+    level: options.Level = GROUND,
+    grid: options.Grid = None,
+    datum: options.DatumText = None,
+    option: options.Options = None,
+    derive: Annotated[bool, typer.Option("--derive/--no-derive", help="Derive layers that no file has told.")] = True,
+    as_json: options.Json = False,
+) -> None:
+    """Convert files on this machine: no server, nothing stored.
+
+    A map of several files becomes a folder, or a ZIP where the output's name ends in .zip. Options are the wanted
+    format's; those it does not know go to the readers.
+    """
+    from app import formats, parameters
+    from app.bundle import Hints
+    from app.convert import offline
+
+    if out == "-" and as_json:
+        raise typer.BadParameter("--json and -o - both want standard output")
+    known = formats.get_format(to)
+    ours = {p["name"] for p in parameters.describe(known.write_options)}
+    values = options.pairs(option)
+    files, _, notes = _collect(paths)
+    hints = Hints(format, _layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})
+    wanted = {k: v for k, v in values.items() if k in ours}
+    with output.progress_bar(f"converting to {to}"):
+        data = {f.name: f.path.read_bytes() for f in files}
+        made = offline(data, to, hints=hints, datum=options.datum(datum), options=wanted, derived=derive)
+    as_folder = write.wants_folder(out) or (len(made.files) > 1 and out != "-" and not out.lower().endswith(".zip"))
+    names = write.bundle(made.files, Path(out), folder=as_folder)
+    if as_json:
+        output.show_json({"files": names, "report": made.report})
+        return
+    for note in notes:
+        output.say(f"left out: {note}", style="yellow")
+    for name in names if as_folder else [out] if out != "-" else []:
+        output.say(f"wrote {Path(out) / name if as_folder else name}")
+    show_report(made.report)
+
+
+def list_formats(as_json: options.Json = False) -> None:
+    """All formats that are read and served, with their options. Needs no server."""
+    from app import formats, parameters
+
+    known: list[dict[str, Any]] = [
+        {
+            "id": f.name,
+            "title": f.title,
+            "files": list(f.files),
+            "media_types": list(f.media_types),
+            "read": f.read is not None,
+            "write": f.write is not None,
+            "layers": [layer for layer in LAYERS if layer in f.carries],
+            "read_options": parameters.describe(f.read_options),
+            "write_options": parameters.describe(f.write_options),
+        }
+        for f in formats.all_formats().values()
+    ]
+    if as_json:
+        output.show_json(known)
+        return
+    rows = [
+        (
+            f["id"],
+            f["title"],
+            "yes" if f["read"] else "-",
+            ", ".join(f["files"]) if f["write"] else "-",
+            ", ".join(f["layers"]),
+            ", ".join(p["name"] for p in f["write_options"]) or "-",
+        )
+        for f in known
+    ]
+    output.show_table(("format", "what it is", "read", "served as", "layers", "options"), rows)
+
+
+def coverage(
+    environment: Annotated[str, typer.Argument(help="Name of the environment.")],
+    version: options.Version = "latest",
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Which formats an environment's maps can be had in: directly, by deriving, or what is missing."""
+    with Client(server, token) as client:
+        rows = client.get(path_of("environments", environment, "versions", version, "maps"))
+    if as_json:
+        output.show_json(rows)
+        return
+    told = []
+    for row in rows:
+        steps = [_step(step) for step in row.get("chain") or ()]
+        told.append((row["format"], row["state"], ", then ".join(steps) or "; ".join(row.get("missing") or ()) or "-"))
+    output.show_table(("format", "state", "how, or what to supply"), told)
+
+
+def show_report(report: Mapping[str, Any]) -> None:
+    """What a map is made of and what it lost, for people."""
+    for line in report.get("layers") or ():
+        steps = ", ".join(_step(step) for step in line.get("steps") or ())
+        name = "/".join(str(line[k]) for k in ("layer", "level", "name") if line.get(k))
+        output.say(f"{name}: {line['information']}{f' ({steps})' if steps else ''}")
+    for line in report.get("template") or ():
+        output.say(f"filled in: {line['what']} = {line['value']}: {line['why']}")
+    for line in report.get("dropped") or ():
+        output.say(f"dropped: {line['count']} × {line['what']}: {line['why']}", style="yellow")
+    output.show_warnings(report.get("warnings") or ())
+
+
+def _collect(paths: Sequence[Path]) -> tuple[list[LocalFile], str | None, tuple[str, ...]]:
+    """Files to upload, a name for the environment where they are one folder, and what was left out."""
+    for path in paths:
+        if not path.exists():
+            raise NotFound(f"{path} does not exist")
+    if len(paths) == 1 and paths[0].is_dir():
+        found = folders.collect(paths[0])
+        inner = found.root if found.is_template else paths[0].resolve()
+        try:
+            name = folders.environment_name(inner.name)
+        except Invalid:
+            name = None
+        return list(found.files), name, found.notes
+    files: list[LocalFile] = []
+    notes: list[str] = []
+    for path in paths:
+        if path.is_dir():
+            found = folders.collect(path)
+            notes += found.notes
+            prefix = "" if found.is_template else f"{path.resolve().name}/"
+            files += [LocalFile(prefix + f.name, f.path, f.size) for f in found.files]
+        else:
+            files.append(folders.single(path))
+    names = [f.name for f in files]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise Invalid(f"two of the files are called {twice[0]}: import their folder, or one after the other")
+    return files, None, tuple(notes)
+
+
+def _ensure(client: Client, name: str, paths: Sequence[Path], datum: Datum | None, *, dry_run: bool) -> bool:
+    """Make sure that the environment is there and has the datum that was asked for: whether it was made now."""
+    try:
+        known = client.get(path_of("environments", name))
+    except Refused as refused:
+        if refused.status != 404:
+            raise
+        if dry_run:
+            detail = f"there is no environment {name} yet, and a dry run does not create it"
+            raise Refused({"title": "No such environment", "detail": detail}, status=404) from refused
+        title = paths[0].resolve().name if len(paths) == 1 and paths[0].is_dir() else ""
+        body: dict[str, Any] = {"name": name, "title": title or None}
+        body["datum"] = datum.as_dict() if datum else None
+        client.post("/environments", body)
+        return True
+    if datum is not None and (known.get("datum") or {}) != datum.as_dict() and not dry_run:
+        client.patch(path_of("environments", name), {"datum": datum.as_dict()})
+    return False
+
+
+def _default_message(paths: Sequence[Path]) -> str:
+    names = [path.resolve().name for path in paths]
+    return f"import {', '.join(names[:3])}{' …' if len(names) > 3 else ''}"
+
+
+def _show_import(name: str, status: int, body: Mapping[str, Any], *, dry_run: bool, made: bool) -> None:
+    if dry_run:
+        output.show(f"{name}: this would make a version")
+    elif status == 201:
+        output.show(f"{name}: version {body['version']}{' of the new environment' if made else ''}")
+    else:
+        output.show(f"{name}: nothing changed, version {body['version']} stays")
+    changes = [(what, change) for what, change in (body.get("changes") or {}).items()]
+    for what, change in changes:
+        output.show(f"  {what}: {counts(change)}")
+    told = [f"{layer} {kind}" for layer, kind in (body.get("information") or {}).items() if kind != "missing"]
+    if told:
+        output.show(f"  holds: {', '.join(told)}")
+    sources = body.get("sources") or []
+    used = [s for s in sources if s.get("used")]
+    output.show(f"  files: {len(used)} used, {len(sources) - len(used)} kept as sources only")
+    for source in used:
+        output.show(f"    {source['name']} ({source.get('format') or 'part of a map'}, {output.size(source['size'])})")
+    idle = [s["name"] for s in sources if not s.get("used") and s["size"]]
+    if idle:
+        output.show(f"  not used: {', '.join(idle[:20])}{f' and {len(idle) - 20} more' if len(idle) > 20 else ''}")
+    output.show_warnings(body.get("warnings") or ())
+
+
+def _preferred(client: Client, environment: str) -> str:
+    """What the short address for robots gives: production where there is one, else latest."""
+    names = {row["channel"] for row in channel_rows(client, environment)}
+    return "production" if "production" in names else "latest"
+
+
+def _store(got: Download, to: str | None) -> list[str]:
+    """Put a download where the user wants it: the places."""
+    if to is not None and write.wants_folder(to):
+        if got.is_zip:
+            return [str(Path(to) / name) for name in write.unpack(got.path, Path(to))]
+        target = write.inside(Path(to), got.name)
+    else:
+        target = Path(to or got.name)
+    with got.path.open("rb") as stream:
+        if to == "-":
+            write.to_stdout(stream)
+            return []
+        write.to_file(target, stream)
+    return [str(target)]
+
+
+def _step(step: Any) -> str:
+    if not isinstance(step, Mapping):
+        return str(step)
+    name = str(step.get("step") or step.get("method") or step.get("name") or "?")
+    return f"{step['from']} to {step['to']} ({name})" if "from" in step and "to" in step else name
+
+
+def _layer(text: str | None) -> Any:
+    if text is not None and text not in LAYERS:
+        raise Invalid(f"--layer must be objects, topology, location or zones, got {text!r}")
+    return text

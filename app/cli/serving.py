@@ -1,0 +1,304 @@
+"""The server's side of the command line: serve and migrate, and the demo that ``serve --demo`` brings along."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import multiprocessing
+import os
+import secrets
+import signal
+import socket
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from http import HTTPStatus
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app.cli import options, output
+from app.cli.client import Client, Refused
+from app.errors import FleetMapError, Invalid, Unavailable
+
+if TYPE_CHECKING:
+    from app.config import Settings
+
+SECRETS_DIR = Path("/run/secrets")
+"""Where containers mount secrets: a file named like a setting (``fleetmap_admin_token``) holds its value."""
+
+STOP_SECONDS = 20
+"""How long requests that are being answered may take after SIGTERM."""
+
+START_SECONDS = 60.0
+"""How long the demo waits for the server to be ready."""
+
+NOT_FLAGS = frozenset({"admin_token"})
+"""Settings that must not stand in a command line, where every user of the machine can read them."""
+
+DEMO_TOKEN = "demo-token"  # noqa: S105  the name of a file
+"""In the data folder, readable for its owner: lets ``serve --demo`` print commands that work at every start."""
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """The administrator's token, where it is known, and whether it was made just now."""
+
+    text: str | None
+    made: bool = False
+
+
+def serve(*, demo: bool = False, **values: Any) -> None:
+    """Start the server in the foreground; it stops cleanly on SIGTERM and Ctrl-C.
+
+    Every option is also a setting: FLEETMAP_… in the environment or in a file .env, or a file /run/secrets/fleetmap_….
+    """
+    settings = load_settings(values)
+    listener = listen(settings.host, settings.port)
+    try:
+        address = address_of(listener)
+        settings = settings.model_copy(update={"port": listener.getsockname()[1]})
+        access = prepare(settings, demo=demo)
+        os.environ.update(settings.as_environment())  # what worker processes read
+        output.show(f"Fleet Map Server: {address} · documentation: {address}/docs")
+        if access.made:
+            output.show(f"administrator's token, shown only this once: {access.text}")
+        sys.stdout.flush()
+        if demo:
+            threading.Thread(target=_bring_demo, args=(address, access.text), daemon=True).start()
+        _run(settings, listener)
+    finally:
+        listener.close()
+
+
+def migrate(
+    database_url: Annotated[
+        str | None, typer.Option("--database-url", help="The database [default: FLEETMAP_DATABASE_URL].")
+    ] = None,
+    data_dir: Annotated[
+        Path | None, typer.Option("--data-dir", help="The server's folder [default: FLEETMAP_DATA_DIR].")
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
+    """Bring the database to this release's schema: PostgreSQL before the server starts, SQLite at any time."""
+    settings = load_settings({"database_url": database_url, "data_dir": data_dir})
+    with output.progress_bar("migrating"), _store(settings) as store:
+        store.migrate()
+        store.check()
+    if as_json:
+        output.show_json({"database": _without_password(settings.database), "migrated": True})
+    else:
+        output.show(f"{_without_password(settings.database)}: the schema is current")
+
+
+def demo(server: options.Server = None, token: options.Token = None, as_json: options.Json = False) -> None:
+    """Put the small demo environment on a running server. Doing it again changes nothing."""
+    from app.cli import demo as orchard
+
+    with Client(server, token) as client:
+        made = orchard.install(client)
+        lines = orchard.curl_lines(client.server, client.token)
+    if as_json:
+        output.show_json(made)
+        return
+    output.show(f"{made['environment']}: version {made['version']}{'' if made['created'] else ' was there already'}")
+    for line in lines:
+        output.show(f"  {line}")
+
+
+def application() -> Any:
+    """The ASGI application, in a server process of its own: it ends with the process that started it."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    return importlib.import_module("app.main").create_app(load_settings({}))
+
+
+def load_settings(values: Mapping[str, Any]) -> Settings:
+    """The settings: flags first, then the environment, ``.env``, mounted secrets. BadParameter for unusable ones."""
+    from pydantic import ValidationError
+
+    from app.config import Settings
+
+    given = {name: value for name, value in values.items() if value not in (None, False)}
+    given |= {"_secrets_dir": SECRETS_DIR} if SECRETS_DIR.is_dir() else {}
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        reasons = []
+        for item in error.errors():
+            name = ".".join(str(part) for part in item["loc"])
+            reason = str(item["msg"]).removeprefix("Value error, ")
+            flag = f"--{name.replace('_', '-')} (FLEETMAP_{name.upper()}): " if name else ""
+            reasons.append(flag + reason)
+        raise typer.BadParameter("; ".join(reasons)) from error
+
+
+def with_flags(function: Callable[..., None]) -> Callable[..., None]:
+    """``serve`` with an option for every setting, as ``app.config.Settings`` declares them."""
+    from app.config import Settings
+
+    def command(**values: Any) -> None:
+        function(**values)
+
+    demo = Annotated[bool, typer.Option("--demo", help="Bring a small demo environment along, and commands to try.")]
+    parameters: dict[str, tuple[Any, bool | None]] = {"demo": (demo, False)}
+    for name, field in Settings.model_fields.items():
+        if name in NOT_FLAGS:
+            continue
+        flag = f"--{name.replace('_', '-')}"
+        default = None if field.default_factory or field.default is None else field.default
+        note = "" if default is None or default is False else f" [default: {default}]"
+        text = f"{(field.description or '').replace('`', '')}{note}"
+        if field.annotation is bool:
+            parameters[name] = (Annotated[bool, typer.Option(flag, help=text)], False)
+        else:
+            parameters[name] = (Annotated[str | None, typer.Option(flag, help=text, show_default=False)], None)
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [inspect.Parameter(n, keyword, default=d, annotation=a) for n, (a, d) in parameters.items()]
+    )
+    command.__annotations__ = {name: annotation for name, (annotation, _) in parameters.items()}
+    command.__doc__ = function.__doc__
+    return command
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket; Unavailable where the address is taken or not this machine's."""
+    try:
+        family, kind, protocol, _, place = socket.getaddrinfo(
+            host.strip("[]"), port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listener = socket.socket(family, kind, protocol)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(place)
+        listener.set_inheritable(True)
+    except OSError as error:
+        detail = f"cannot listen on {host} port {port}: {error.strerror or error}; choose another with --port or --host"
+        raise Unavailable(detail) from error
+    return listener
+
+
+def address_of(listener: socket.socket) -> str:
+    """Where a client on this machine reaches it."""
+    host, port = listener.getsockname()[:2]
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104  compared, not bound
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def prepare(settings: Settings, *, demo: bool = False) -> Access:
+    """Make the store ready before the first request: schema (SQLite), leftovers of a crash, the first token."""
+    with _store(settings) as store:
+        if settings.database.startswith("sqlite"):
+            store.migrate()
+        store.check()
+        if settings.insecure_no_auth:
+            return Access(None)
+        access = Access(None)
+        kept = settings.data_dir / DEMO_TOKEN
+        if settings.admin_token is not None:
+            access = Access(settings.admin_token.get_secret_value())
+        elif demo and kept.is_file():
+            access = Access(kept.read_text().strip())
+        elif demo or not any(token.role == "admin" for token in store.tokens()):
+            access = Access(secrets.token_urlsafe(32), made=True)
+        if access.text is not None and store.find_token(access.text) is None:
+            store.create_token("demo" if demo else "administrator", "admin", token=access.text)
+    if demo and access.made and access.text is not None:
+        with open(os.open(kept, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as stream:  # noqa: PTH123  with its mode
+            stream.write(access.text + "\n")
+    return access
+
+
+def _store(settings: Settings) -> Any:
+    from contextlib import closing
+
+    from app.store import Store
+
+    try:
+        settings.data_dir.mkdir(parents=True, exist_ok=True)
+        settings.blob_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Unavailable(f"{error.filename}: {error.strerror}; choose a folder with --data-dir") from error
+    return closing(Store(settings.database, settings.blob_dir))
+
+
+def _without_password(url: str) -> str:
+    from sqlalchemy import make_url
+
+    return make_url(url).render_as_string(hide_password=True)
+
+
+def _run(settings: Settings, listener: socket.socket) -> None:
+    import uvicorn
+    from uvicorn.supervisors import Multiprocess
+
+    config = uvicorn.Config(
+        "app.cli.serving:application",
+        factory=True,
+        host=settings.host,
+        port=settings.port,
+        workers=settings.workers,
+        log_level=settings.log_level,
+        access_log=settings.log_level == "debug",
+        server_header=False,
+        timeout_graceful_shutdown=STOP_SECONDS,
+    )
+    # Uvicorn raises the signal again once it has shut down; after a clean stop the exit status shall be 0.
+    for signal_number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(signal_number, lambda *_: None)
+    if settings.workers > 1:
+        supervisor = Multiprocess(config, sockets=[listener])
+        supervisor.run()
+        if any(process.exitcode for process in supervisor.processes):
+            raise typer.Exit(1)
+        return
+    server = uvicorn.Server(config)
+    try:
+        server.run(sockets=[listener])
+    except SystemExit as error:  # the application did not start; uvicorn has logged why
+        raise typer.Exit(1) from error
+
+
+def _end_with(parent: Any) -> None:
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _bring_demo(address: str, token: str | None) -> None:
+    """Once the server answers: install the demo and print what to try."""
+    from app.cli import demo as orchard
+
+    try:
+        _wait_ready(address)
+        with Client(address, token) as client:
+            made = orchard.install(client)
+    except (FleetMapError, Refused, OSError) as error:
+        output.say(f"the demo could not be installed: {error}", style="yellow")
+        return
+    output.show(f"demo environment: {made['environment']}, version {made['version']}")
+    if token:
+        output.show(f"administrator's token: {token}")
+    output.show("try:")
+    for line in orchard.curl_lines(address, token):
+        output.show(f"  {line}")
+    sys.stdout.flush()
+
+
+def _wait_ready(address: str) -> None:
+    deadline = time.monotonic() + START_SECONDS
+    while True:
+        try:
+            with urllib.request.urlopen(f"{address}/readyz", timeout=5) as answer:  # noqa: S310  our own address
+                if answer.status == HTTPStatus.OK:
+                    return
+        except (OSError, urllib.error.URLError):
+            pass
+        if time.monotonic() > deadline:
+            raise Invalid(f"{address} was not ready within {START_SECONDS:g} seconds")
+        time.sleep(0.1)

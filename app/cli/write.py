@@ -1,0 +1,93 @@
+"""Putting maps on this machine's disk: whole or not at all, and never outside the folder that was named."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import shutil
+import sys
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from app.errors import Invalid
+
+STDOUT = Path("-")
+
+
+def wants_folder(output: str | None) -> bool:
+    """Whether the user means a folder: it is one, or is written with a slash at its end."""
+    return output is not None and (output.endswith("/") or Path(output).is_dir())
+
+
+def to_stdout(stream: IO[bytes]) -> None:
+    """All bytes to standard output; Invalid where that is a terminal."""
+    if sys.stdout.isatty():
+        raise Invalid("this is no text for a terminal: redirect the output, or name a file with -o")
+    shutil.copyfileobj(stream, sys.stdout.buffer)
+    sys.stdout.buffer.flush()
+
+
+def to_file(path: Path, stream: IO[bytes]) -> None:
+    """All bytes to a file: written beside it and renamed, so that no reader sees half a map."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.")
+    except OSError as error:
+        raise Invalid(f"{path} cannot be written: {error.strerror or error}") from error
+    try:
+        with os.fdopen(handle, "wb") as target:
+            shutil.copyfileobj(stream, target)
+        mask = os.umask(0)
+        os.umask(mask)
+        Path(temporary).chmod(0o666 & ~mask)
+        Path(temporary).replace(path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            Path(temporary).unlink()
+        if isinstance(error, OSError):
+            raise Invalid(f"{path} cannot be written: {error.strerror or error}") from error
+        raise
+
+
+def unpack(archive: Path, folder: Path) -> list[str]:
+    """The files of a served archive below a folder: their names. Names that lead out of it are refused."""
+    names = []
+    with zipfile.ZipFile(archive) as opened:
+        members = [m for m in opened.infolist() if not m.is_dir()]
+        targets = [inside(folder, member.filename) for member in members]
+        for member, target in zip(members, targets, strict=True):
+            with opened.open(member) as stream:
+                to_file(target, stream)
+            names.append(member.filename)
+    return names
+
+
+def inside(folder: Path, name: str) -> Path:
+    """The place of a named file below a folder; Invalid for names that would leave it."""
+    from app.formats._archive import bad_name
+
+    reason = bad_name(name)
+    if reason:
+        raise Invalid(f"the map has a file called {name!r}, which cannot be written here: its name {reason}")
+    return folder.joinpath(*PurePosixPath(name).parts)
+
+
+def bundle(files: Mapping[str, bytes], output: Path, *, folder: bool) -> list[str]:
+    """A map's files as a folder, a file (several as a ZIP), or on standard output: the names that were written."""
+    from app.formats._archive import pack
+
+    targets = {name: inside(output, name) for name in files}
+    if folder:
+        for name, data in files.items():
+            to_file(targets[name], io.BytesIO(data))
+        return list(files)
+    whole = next(iter(files.values())) if len(files) == 1 else pack(files, next(iter(files)))
+    if output == STDOUT:
+        to_stdout(io.BytesIO(whole))
+    else:
+        to_file(output, io.BytesIO(whole))
+    return list(files)
