@@ -17,7 +17,7 @@ Refused, each with its line: NaN and infinities, integers beyond 64 bit, duplica
 YAML's own scalars and collections, ``%TAG``, a second document, nesting deeper than ``Limits.yaml_depth``, more than
 ``Limits.yaml_nodes`` nodes, aliases that unfold to much more than the file, aliases to a collection that contains them.
 
-``text`` and ``block`` write what every reader takes for the same value: YAML 1.1 (PyYAML) and 1.2 (yaml-cpp, rapidyaml).
+``text``, ``block`` and ``mapping`` write what readers of YAML 1.1 (PyYAML) and 1.2 (yaml-cpp) take for the same value.
 """
 
 from __future__ import annotations
