@@ -197,7 +197,7 @@ class Client:
 
     def _download(self, path: str, params: Mapping[str, Any], target: Path) -> Download:
         while True:
-            with self._reach(), self._http.stream("GET", self._address(path), params=params) as answer:
+            with self._reach(), self._http.stream("GET", self._address(path), params=params or None) as answer:
                 if answer.status_code == httpx.codes.OK:
                     return _receive(answer, target)
                 answer.read()
@@ -225,7 +225,7 @@ class Client:
             pause = RETRY_SECONDS * 2 ** (TRIES - 1 - left)
             try:
                 answer = self._http.request(
-                    method, self._address(path), params=params, json=json, headers=headers, **(body() if body else {})
+                    method, self._address(path), params=params or None, json=json, headers=headers, **(body() if body else {})
                 )
             except httpx.ConnectError as error:
                 raise _unreachable(self.server, error) from error

@@ -24,7 +24,7 @@ import typer
 
 from app.cli import options, output
 from app.cli.client import Client, Refused
-from app.errors import FleetMapError, Invalid, Unavailable
+from app.errors import FleetMapError, Unavailable
 
 if TYPE_CHECKING:
     from app.config import Settings
@@ -275,7 +275,7 @@ def _bring_demo(address: str, token: str | None) -> None:
     from app.cli import demo as orchard
 
     try:
-        _wait_ready(address)
+        wait_ready(address)
         with Client(address, token) as client:
             made = orchard.install(client)
     except (FleetMapError, Refused, OSError) as error:
@@ -290,8 +290,9 @@ def _bring_demo(address: str, token: str | None) -> None:
     sys.stdout.flush()
 
 
-def _wait_ready(address: str) -> None:
-    deadline = time.monotonic() + START_SECONDS
+def wait_ready(address: str, *, seconds: float = START_SECONDS) -> None:
+    """Until the server says that it is ready; Unavailable where it does not in time."""
+    deadline = time.monotonic() + seconds
     while True:
         try:
             with urllib.request.urlopen(f"{address}/readyz", timeout=5) as answer:  # noqa: S310  our own address
@@ -300,5 +301,5 @@ def _wait_ready(address: str) -> None:
         except (OSError, urllib.error.URLError):
             pass
         if time.monotonic() > deadline:
-            raise Invalid(f"{address} was not ready within {START_SECONDS:g} seconds")
+            raise Unavailable(f"{address} was not ready within {seconds:g} seconds")
         time.sleep(0.1)

@@ -1,0 +1,144 @@
+"""A server of its own for the command line's tests, started as a user starts it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.cli import run
+
+TOKEN = "administrator-of-the-tests"
+START_SECONDS = 60.0
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a command printed and how it ended."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.out)
+
+
+Fleetmap = Callable[..., Result]
+
+
+class ServerProcess:
+    """``fleetmap serve`` in a process of its own; ``lines`` is what it printed."""
+
+    def __init__(self, *arguments: str, environment: Mapping[str, str], folder: Path) -> None:
+        clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "app.cli", "serve", "--port", "0", *arguments],
+            env={**clean, **environment, "PYTHONUNBUFFERED": "1", "PYTHONPATH": str(Path(__file__).parents[2])},
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+        self.lines: list[str] = []
+        self._news = threading.Condition()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            with self._news:
+                self.lines.append(line.rstrip("\n"))
+                self._news.notify_all()
+        with self._news:
+            self._news.notify_all()
+
+    def wait_for(self, pattern: str, seconds: float = START_SECONDS) -> re.Match[str]:
+        """The first printed line that fits; fails where the server ends or the time is over."""
+
+        def found() -> re.Match[str] | None:
+            return next((m for line in self.lines if (m := re.search(pattern, line))), None)
+
+        with self._news:
+            self._news.wait_for(lambda: found() or not self._reader.is_alive(), seconds)
+        match = found()
+        assert match, f"no line with {pattern!r}; printed:\n" + "\n".join(self.lines)
+        return match
+
+    @property
+    def address(self) -> str:
+        return self.wait_for(r"Fleet Map Server: (http://\S+)")[1]
+
+    def stop(self, number: int = signal.SIGTERM, seconds: float = 30.0) -> int:
+        """Signal it and wait: its exit status. Whatever is left of its group is killed."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        try:
+            return self.process.wait(seconds)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait(5)
+            self._reader.join(5)
+            assert self.process.stdout is not None
+            self.process.stdout.close()
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a running server with an empty SQLite store."""
+    folder = tmp_path_factory.mktemp("server")
+    process = ServerProcess(
+        "--data-dir", str(folder / "data"), environment={"FLEETMAP_ADMIN_TOKEN": TOKEN}, folder=folder
+    )
+    try:
+        address = process.address
+        _until_ready(address)
+        yield address
+    finally:
+        process.stop()
+
+
+def _until_ready(address: str) -> None:
+    from app.cli.serving import wait_ready
+
+    wait_ready(address, seconds=START_SECONDS)
+
+
+@pytest.fixture
+def offline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Fleetmap:
+    """Run a command in this process, without a server in its environment."""
+    for name in list(os.environ):
+        if name.startswith("FLEETMAP_"):
+            monkeypatch.delenv(name)
+
+    def call(*arguments: str | Path) -> Result:
+        capsys.readouterr()
+        status = run([str(a) for a in arguments])
+        told = capsys.readouterr()
+        return Result(status, told.out, told.err)
+
+    return call
+
+
+@pytest.fixture
+def fleetmap(server: str, offline: Fleetmap, monkeypatch: pytest.MonkeyPatch) -> Fleetmap:
+    """Run a command in this process against the server, as administrator."""
+    monkeypatch.setenv("FLEETMAP_SERVER", server)
+    monkeypatch.setenv("FLEETMAP_TOKEN", TOKEN)
+    return offline

@@ -1,0 +1,223 @@
+"""The client against a server that misbehaves on purpose: lost answers, busy times, jobs, problems."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.cli import client as clients
+from app.cli.client import Client, LocalFile, Refused
+from app.cli.write import inside, unpack
+from app.errors import Invalid
+
+Answer = tuple[int, dict[str, str], bytes] | None
+"""Status, headers and body; None closes the connection without an answer."""
+
+
+@dataclass
+class Script:
+    """What the server answers, in order (the last one again and again), and what it was asked."""
+
+    answers: list[Answer] = field(default_factory=list)
+    asked: list[tuple[str, str, dict[str, str], bytes]] = field(default_factory=list)
+
+
+def reply(status: int, value: Any, media_type: str = "application/json", **headers: str) -> Answer:
+    body = value if isinstance(value, bytes) else json.dumps(value).encode()
+    return status, {"Content-Type": media_type} | {k.replace("_", "-"): v for k, v in headers.items()}, body
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Script, str]]:
+    told = Script()
+
+    class Handler(BaseHTTPRequestHandler):
+        def answer(self) -> None:
+            body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
+            told.asked.append((self.command, self.path, dict(self.headers), body))
+            answer = told.answers.pop(0) if len(told.answers) > 1 else told.answers[0]
+            if answer is None:
+                self.close_connection = True
+                return
+            status, headers, content = answer
+            self.send_response(status)
+            for name, value in {**headers, "Content-Length": str(len(content))}.items():
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(content)
+
+        do_GET = do_POST = do_PUT = do_DELETE = answer
+
+        def log_message(self, format: str, *args: Any) -> None:
+            pass
+
+    monkeypatch.setattr(clients, "RETRY_SECONDS", 0.01)
+    monkeypatch.setattr(clients, "POLL_SECONDS", 0.01)
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+    thread.start()
+    yield told, f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.fixture
+def talk(script: tuple[Script, str]) -> Iterator[Callable[..., tuple[Client, Script]]]:
+    opened: list[Client] = []
+
+    def start(*answers: Answer, token: str | None = None) -> tuple[Client, Script]:
+        script[0].answers[:] = answers
+        opened.append(Client(script[1], token))
+        return opened[-1], script[0]
+
+    yield start
+    for one in opened:
+        one.close()
+
+
+def local(tmp_path: Path, name: str, content: bytes) -> LocalFile:
+    path = tmp_path / name.replace("/", "_")
+    path.write_bytes(content)
+    return LocalFile(name, path, len(content))
+
+
+Talk = Callable[..., tuple[Client, Script]]
+
+
+def test_an_upload_whose_answer_is_lost_is_sent_again_under_the_same_key(talk: Talk, tmp_path: Path) -> None:
+    client, script = talk(None, None, reply(201, {"version": 1}))
+    files = [local(tmp_path, "a/b.yaml", b"x" * 100_000), local(tmp_path, "ü.kml", b"y")]
+    assert client.upload("/environments/e/versions", files, {"mode": "merge"}) == (201, {"version": 1})
+    assert len(script.asked) == 3
+    assert len({headers["Idempotency-Key"] for _, _, headers, _ in script.asked}) == 1
+    bodies = [body.split(b"\r\n", 1)[1].replace(body.split(b"\r\n", 1)[0], b"") for *_, body in script.asked]
+    assert bodies[0] == bodies[1] == bodies[2]
+    assert b'filename="a/b.yaml"' in bodies[0]
+    assert 'filename="ü.kml"'.encode() in bodies[0]
+    assert b"x" * 100_000 in bodies[0]
+    assert b'name="mode"\r\n\r\nmerge' in bodies[0]
+    assert all(file._stream is None for file in files)
+
+
+def test_a_lost_answer_is_told_in_the_end(talk: Talk, tmp_path: Path) -> None:
+    client, script = talk(None)
+    with pytest.raises(Refused, match="no answer from"):
+        client.upload("/environments/e/versions", [local(tmp_path, "a", b"1")], {})
+    assert len(script.asked) == clients.TRIES
+
+
+def test_what_must_not_happen_twice_is_asked_once(talk: Talk) -> None:
+    client, script = talk(None)
+    with pytest.raises(Refused, match="no answer"):
+        client.post("/environments", {"name": "farm"})
+    assert len(script.asked) == 1
+
+
+def test_a_busy_server_is_waited_for_as_it_says(talk: Talk) -> None:
+    busy = reply(503, {"title": "Unavailable", "detail": "too much"}, Retry_After="0")
+    client, script = talk(busy, busy, reply(200, [1]))
+    assert client.get("/formats") == [1]
+    assert len(script.asked) == 3
+
+
+def test_a_job_is_followed_and_the_map_asked_for_again(talk: Talk) -> None:
+    client, script = talk(
+        reply(202, {"id": "7"}, Location="/api/v1/jobs/7"),
+        reply(200, {"id": "7", "state": "running", "progress": 0.5, "detail": "deriving"}),
+        reply(200, {"id": "7", "state": "done", "progress": 1}),
+        reply(
+            200, b"<kml/>", "application/vnd.google-earth.kml+xml", Content_Disposition='attachment; filename="map.kml"'
+        ),
+    )
+    with client.download("/environments/e/versions/1/maps/kml", {"grid": "map"}) as got:
+        assert got.path.read_bytes() == b"<kml/>"
+        assert got.name == "map.kml"
+        assert not got.is_zip
+    where = "/api/v1/environments/e/versions/1/maps/kml?grid=map"
+    assert [path for _, path, _, _ in script.asked] == [where, "/api/v1/jobs/7", "/api/v1/jobs/7", where]
+    assert not got.path.exists()
+
+
+def test_a_job_that_fails_tells_its_problem(talk: Talk) -> None:
+    problem = {"title": "Missing layer", "status": 422, "detail": "there is no network"}
+    client, _ = talk(
+        reply(202, {"id": "7"}, Location="/api/v1/jobs/7"),
+        reply(200, {"id": "7", "state": "failed", "progress": 0.1, "problem": problem}),
+    )
+    with pytest.raises(Refused, match="there is no network"), client.download("/x"):
+        pass
+
+
+def test_a_missing_token_gets_a_hint(talk: Talk) -> None:
+    client, script = talk(reply(401, {"title": "Token needed", "detail": "give a token"}, "application/problem+json"))
+    with pytest.raises(Refused) as caught:
+        client.get("/formats")
+    assert "FLEETMAP_TOKEN" in caught.value.hint
+    client, script = talk(reply(401, {"detail": "x"}, "application/problem+json"), token="secret-token")
+    with pytest.raises(Refused) as caught:
+        client.get("/formats")
+    assert "expired" in caught.value.hint
+    assert script.asked[-1][2]["Authorization"] == "Bearer secret-token"
+
+
+def test_another_kind_of_server_is_recognised(talk: Talk) -> None:
+    client, _ = talk(reply(200, b"<html>", "text/html"))
+    with pytest.raises(Refused, match="no JSON"):
+        client.get("/formats")
+    client, _ = talk(reply(404, b"<html>", "text/html"))
+    with pytest.raises(Refused, match="answered 404"):
+        client.get("/formats")
+
+
+def test_pages_are_followed_as_far_as_they_are_wanted(talk: Talk) -> None:
+    def pages() -> list[Answer]:
+        first = reply(200, [1, 2], Link='</api/v1/versions?before=2>; rel="next"')
+        return [first, reply(200, [3])]
+
+    client, script = talk(*pages())
+    assert list(client.pages("/versions", {"limit": 2})) == [1, 2, 3]
+    assert [path for _, path, _, _ in script.asked] == ["/api/v1/versions?limit=2", "/api/v1/versions?before=2"]
+    client, script = talk(*pages())
+    assert list(client.pages("/versions", {"limit": 2}, limit=1)) == [1]
+    client, script = talk(reply(200, {"items": [1], "next": "abc"}), reply(200, {"items": [2], "next": None}))
+    assert list(client.pages("/environments", {})) == [1, 2]
+    assert script.asked[-1][1] == "/api/v1/environments?cursor=abc"
+
+
+@pytest.mark.parametrize("given", ['attachment; filename="../../etc/passwd"', "attachment; filename=..", "attachment"])
+def test_the_server_chooses_no_place_on_this_machine(talk: Talk, given: str) -> None:
+    client, _ = talk(reply(200, b"x", "text/plain", Content_Disposition=given))
+    with client.download("/maps/farm/kml") as got:
+        assert "/" not in got.name
+        assert got.name not in ("", ".", "..")
+
+
+def test_an_archive_is_unpacked_below_its_folder_or_not_at_all(tmp_path: Path) -> None:
+    import zipfile
+
+    with zipfile.ZipFile(tmp_path / "good.zip", "w") as archive:
+        archive.writestr("map.yaml", "image: map.pgm")
+        archive.writestr("models/shelf/model.sdf", "<sdf/>")
+    assert unpack(tmp_path / "good.zip", tmp_path / "out") == ["map.yaml", "models/shelf/model.sdf"]
+    assert (tmp_path / "out/models/shelf/model.sdf").read_text() == "<sdf/>"
+    with zipfile.ZipFile(tmp_path / "bad.zip", "w") as archive:
+        archive.writestr("map.yaml", "x")
+        archive.writestr("../escaped", "x")
+    with pytest.raises(Invalid, match="escaped"):
+        unpack(tmp_path / "bad.zip", tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+    assert not (tmp_path / "escaped").exists()
+
+
+@pytest.mark.parametrize("name", ["/etc/x", "a/../../x", "C:\\x", "a\x00b", ""])
+def test_names_that_leave_the_folder_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(Invalid):
+        inside(tmp_path, name)

@@ -1,0 +1,94 @@
+"""What is taken of a folder, and what an environment made from it is called."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from app.cli import folder
+from app.errors import Invalid
+
+
+def put(root: Path, *names: str) -> None:
+    for name in names:
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(name)
+
+
+def names(found: folder.Folder) -> list[str]:
+    return [f.name for f in found.files]
+
+
+@pytest.fixture
+def template(tmp_path: Path) -> Path:
+    root = tmp_path / "Farm North (2)"
+    put(root, "config/location/datum.yaml", "config/metric/map/map.yaml", "config/properties.sh", "environment.sh")
+    put(root, "README.md", "package.xml", ".git/config", "config/.git/HEAD", "launch/all.launch.py")
+    return root
+
+
+def test_a_template_gives_its_config_and_scripts_alone(template: Path) -> None:
+    found = folder.collect(template)
+    assert found.is_template
+    assert names(found) == [
+        "config/location/datum.yaml",
+        "config/metric/map/map.yaml",
+        "config/properties.sh",
+        "environment.sh",
+    ]
+
+
+def test_the_config_folder_itself_gives_the_same_names(template: Path) -> None:
+    assert names(folder.collect(template / "config")) == names(folder.collect(template))
+    assert folder.collect(template / "config").root == template
+
+
+def test_any_other_folder_gives_all_its_files_but_no_version_control(tmp_path: Path) -> None:
+    put(tmp_path, "building.yaml", "plans/office.png", ".git/HEAD", "config/robot.yaml")
+    found = folder.collect(tmp_path)
+    assert not found.is_template
+    assert names(found) == ["building.yaml", "config/robot.yaml", "plans/office.png"]
+
+
+def test_links_out_of_the_folder_are_left_out_and_told(template: Path, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text("not for the server")
+    (template / "config/world").mkdir()
+    (template / "config/world/linked.kml").symlink_to(tmp_path / "secret")
+    (template / "config/world/inner.yaml").symlink_to(template / "config/location/datum.yaml")
+    (template / "config/world/loop").symlink_to(template / "config")
+    (template / "config/world/dangling").symlink_to(template / "nothing")
+    found = folder.collect(template)
+    assert "config/world/inner.yaml" in names(found)
+    assert "config/world/linked.kml" not in names(found)
+    told = " ".join(found.notes)
+    assert "linked.kml" in told
+    assert "loop" in told
+    assert "dangling" in told
+
+
+def test_nothing_to_upload_is_said(tmp_path: Path) -> None:
+    put(tmp_path, ".git/HEAD")
+    with pytest.raises(Invalid, match="no files"):
+        folder.collect(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("Farm North (2)", "farm-north-2"),
+        ("riseholme_park", "riseholme_park"),
+        ("-x-", "x"),
+        ("a" * 80, "a" * 63),
+        ("Größe.v2", "gr-e-v2"),
+    ],
+)
+def test_a_folder_name_becomes_valid(text: str, name: str) -> None:
+    assert folder.environment_name(text) == name
+
+
+@pytest.mark.parametrize("text", ["", "...", "robots", "Server", "日本"])
+def test_a_name_that_cannot_be_used_asks_for_another(text: str) -> None:
+    with pytest.raises(Invalid, match="--environment"):
+        folder.environment_name(text)
