@@ -107,10 +107,13 @@ def text(value: str | float | None) -> str:
             return "'" + value.replace("'", "''") + "'"
         return '"' + "".join(_escaped(c) for c in value) + '"'
     if isinstance(value, float):
-        said = repr(value)
-        # PyYAML takes 1e-09 for a text: it wants a point before the exponent.
-        return said.replace("e", ".0e") if "e" in said and "." not in said else said
+        return decimal(repr(value))
     return "null" if value is None else str(value).lower()
+
+
+def decimal(said: str) -> str:
+    """A float's shortest text as YAML 1.1 wants it: PyYAML takes ``1e-09`` for a text, ``1.0e-09`` for the number."""
+    return said.replace("e", ".0e") if "e" in said and "." not in said else said
 
 
 def block(value: Any, column: int) -> str:

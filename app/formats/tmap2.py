@@ -623,7 +623,7 @@ class _Writer:
         if self.turn is not None:
             inside = [k for k, p in enumerate(chosen.properties) if self._turned(p)]
             xyz[inside] = (xyz[inside] - self.turn.shift) @ self.turn.matrix()
-        said = [t if "e" not in t else str(_yaml.text(float(t))) for t in numbers(xyz.ravel(), METRES)]
+        said = list(map(_yaml.decimal, numbers(xyz.ravel(), METRES)))
         return list(zip(said[::3], said[1::3], said[2::3], strict=True))
 
     def _turned(self, p: Properties) -> bool:

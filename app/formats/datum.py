@@ -1,0 +1,339 @@
+"""datum.yaml: where an environment's (0, 0) is, and the GNSS fence around it.
+
+Positions are [latitude, longitude], degrees WGS 84: the reverse of GeoJSON and KML. The file is the parameter file of
+robot_localization's navsat_transform_node, of mapviz and of gmapping in one.
+Source: the environment_template's config/location/datum.yaml; navsat_transform.cpp for the meaning of ``datum``.
+
+The heading is ``navsat_transform_node.datum[2]``: the yaw in radians, counter-clockwise from east, that the local +x
+axis has on earth; so the bearing of the local +y axis, clockwise from north, is the same angle negated. mapviz'
+altitude is kept and not believed; ``datum_altitude``, which no consumer reads, is ours and stands there only where it
+is not 0.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import Problem, UnreadableFile
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _yaml, register
+from app.formats._text import DEGREES, number
+from app.model.features import Features, features
+from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum
+from app.model.grid import OccupancyGrid
+from app.model.layers import SITE, Layers, PartKey
+
+NAME = "datum"
+FENCE = "fence"
+MAPVIZ_ALTITUDE = 100.0
+HALF_MAP = 100.0
+"""Metres from the datum: the template's map size, where nothing says how far the environment reaches."""
+
+NAVSAT: Mapping[str, Any] = {
+    "magnetic_declination_radians": 0.0,
+    "yaw_offset": 0.0,
+    "zero_altitude": True,
+    "broadcast_utm_transform": False,
+    "broadcast_utm_transform_as_parent_frame": False,
+    "publish_filtered_gps": True,
+    "use_odometry_yaw": False,
+    "wait_for_datum": True,
+}
+"""What the template says besides the datum."""
+
+HEAD = "# Site datum: the place of the local (0, 0), degrees WGS 84\n"
+FENCE_HEAD = "\n# GNSS fence, [latitude, longitude]\n"
+SIZE_HEAD = "\n# Map size (x east, y north), metres from the datum\n"
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """The datum, and the fence as the one polygon of the location layer (longitude, latitude, wgs84).
+
+    All other keys are kept in the collection's document. Raises UnreadableFile with the key that is wrong.
+    """
+    top = _yaml.load(files[context.main or next(iter(files))], context.limits)
+    if not isinstance(top, dict):
+        raise _refuse("must be a mapping with datum_latitude and datum_longitude", "")
+    for key in ("gmapping", "mapviz_initialize_origin", "navsat_transform_node"):
+        if not isinstance(top.get(key, {}), (dict, type(None))):
+            raise _refuse("must be a mapping", key)
+    latitude = _degrees(top.get("datum_latitude"), "datum_latitude", MAX_DATUM_LATITUDE)
+    longitude = _degrees(top.get("datum_longitude"), "datum_longitude", 180.0)
+    altitude = _number(top.get("datum_altitude", 0.0), "datum_altitude")
+    yaw = _yaw(top.get("navsat_transform_node") or {}, latitude, longitude, context)
+    ring = _fence(top.get("gnss_fence"), context)
+    document = {NAME: {key: value for key, value in top.items() if key not in ("gnss_fence", "datum_altitude")}}
+    fence = top.get("gnss_fence")
+    if isinstance(fence, dict) and len(fence) > 1:
+        document[NAME]["gnss_fence"] = {key: value for key, value in fence.items() if key != "gnss_fence_coords"}
+    rows = []
+    if ring is not None:
+        properties: dict[str, Any] = {"kind": FENCE}
+        if (ring[0] == ring[-1]).all():
+            properties[NAME] = {"closed": True}
+        rows.append((FENCE, shapely.Polygon(ring), properties))
+    datum = Datum(latitude, longitude, altitude, _heading(yaw))
+    return Layers({PartKey("location", context.level, SITE): features(rows, "wgs84", document)}, datum)
+
+
+def _refuse(reason: str, where: str) -> UnreadableFile:
+    return UnreadableFile(f"{where}: {reason}" if where else reason, [Problem(reason, where=where or None)])
+
+
+def _number(value: Any, where: str) -> float:
+    """A finite number, also one in quotes."""
+    if isinstance(value, str):
+        try:
+            value = _yaml.scalar(value)
+        except ValueError:
+            value = None
+    if value is None or isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise _refuse("must be a number", where)
+    return float(value)
+
+
+def _degrees(value: Any, where: str, bound: float) -> float:
+    if value is None:
+        raise _refuse("is missing: the datum needs datum_latitude and datum_longitude in degrees", where)
+    degrees = _number(value, where)
+    if not -bound <= degrees <= bound:
+        raise _refuse(f"must be between {-bound:g} and {bound:g} degrees, got {degrees:g}", where)
+    return degrees
+
+
+def _yaw(navsat: Mapping[str, Any], latitude: float, longitude: float, context: ReadContext) -> float:
+    """Radians counter-clockwise from east to the local +x axis."""
+    where = "navsat_transform_node.datum"
+    said = navsat.get("datum")
+    if said is None:
+        return 0.0
+    if not isinstance(said, list) or len(said) < 2:
+        raise _refuse("must be [latitude, longitude, yaw in radians]", where)
+    other = [_number(v, f"{where}[{k}]") for k, v in enumerate(said[:3])]
+    if abs(other[0] - latitude) > 1e-9 or abs(other[1] - longitude) > 1e-9:
+        context.warn("differs from datum_latitude and datum_longitude, which count", where=where)
+    for key in ("yaw_offset", "magnetic_declination_radians"):
+        value = navsat.get(key, 0.0)
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and value != 0:
+            context.warn(
+                f"is {value}: robot_localization adds it to the datum's yaw, this server takes the yaw as it stands",
+                where=f"navsat_transform_node.{key}",
+            )
+    return other[2] if len(other) > 2 else 0.0
+
+
+def _heading(yaw: float) -> float:
+    """Degrees clockwise from true north to the local +y axis, within ±180."""
+    return math.degrees(-math.remainder(yaw, 2 * math.pi)) + 0.0
+
+
+def _fence(said: Any, context: ReadContext) -> NDArray[np.float64] | None:
+    """float64 [n, 2] (longitude, latitude) as the file lists them, or None where there is no fence."""
+    where = "gnss_fence.gnss_fence_coords"
+    if said is not None and not isinstance(said, dict):
+        raise _refuse("must be a mapping with gnss_fence_coords", "gnss_fence")
+    listed = (said or {}).get("gnss_fence_coords")
+    if listed is None or listed == []:
+        context.warn("is missing: the environment has a datum but no fence", where=where)
+        return None
+    if not isinstance(listed, list):
+        raise _refuse("must be a list of [latitude, longitude]", where)
+    ring = np.empty((len(listed), 2))
+    for k, pair in enumerate(listed):
+        at = f"{where}[{k}]"
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise _refuse("must be [latitude, longitude]", at)
+        ring[k] = _degrees(pair[1], f"{at}[1]", 180.0), _degrees(pair[0], f"{at}[0]", 90.0)
+    if len(np.unique(ring, axis=0)) < 3:
+        raise _refuse(f"a fence needs at least 3 different points, this one has {len(np.unique(ring, axis=0))}", where)
+    return ring
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``datum.yaml`` in the template's layout. The caller sees to it that there is a datum."""
+    datum, frame = layers.datum, layers.frame
+    if datum is None or frame is None:
+        raise ValueError("a datum is needed")
+    fence, document, closed = _chosen(layers, context)
+    latitude, longitude = _text(datum.latitude), _text(datum.longitude)
+    out = [HEAD, f"datum_latitude: {latitude}\ndatum_longitude: {longitude}\n"]
+    if datum.altitude:
+        out.append(f"datum_altitude: {_yaml.text(datum.altitude)}\n")
+    out.append(FENCE_HEAD)
+    ring = None if fence is None else shapely.get_coordinates(fence.exterior)
+    if ring is None:
+        context.warn("the environment has no fence: gnss_fence_coords is empty", where="gnss_fence.gnss_fence_coords")
+        pairs = []
+    else:
+        pairs = [f"[{_text(y)}, {_text(x)}]" for x, y in (ring if closed else ring[:-1]).tolist()]
+    out.append(f"gnss_fence:\n  gnss_fence_coords: [{', '.join(pairs)}]\n")
+    more_fence = document.pop("gnss_fence", None)
+    if isinstance(more_fence, dict) and more_fence:
+        out.append(_yaml.mapping(more_fence, 2))
+    out.append(f"{SIZE_HEAD}gmapping:\n")
+    out.append(_ordered(_size(document, layers, ring, context), 2, ("xmin", "xmax", "ymin", "ymax")))
+    old = (document.get("datum_latitude"), document.get("datum_longitude"))
+    out.append("\nmapviz_initialize_origin:" + _mapviz(document, datum, old, context))
+    out.append("\nnavsat_transform_node:\n" + _navsat(document, datum, context))
+    rest = {key: value for key, value in document.items() if key not in _KNOWN}
+    if rest:
+        out.append("\n" + _yaml.mapping(rest, 0))
+    return {"datum.yaml": "".join(out).encode()}
+
+
+_KNOWN = frozenset(
+    {"datum_latitude", "datum_longitude", "gmapping", "mapviz_initialize_origin", "navsat_transform_node"}
+)
+
+
+def _text(degrees: float) -> str:
+    return _yaml.decimal(number(degrees, DEGREES))
+
+
+def _chosen(layers: Layers, context: WriteContext) -> tuple[Any, dict[str, Any], bool]:
+    """(the fence as a polygon in degrees or None, the source's other keys, whether its first point was repeated)."""
+    known: dict[str, Any] = {}
+    found: list[tuple[bool, float, str, Any, bool]] = []
+    lost = 0
+    for key, part in sorted(layers.vector("location").items(), key=lambda item: item[0].level != GROUND):
+        said = part.document.get(NAME)
+        if isinstance(said, dict) and not known:
+            known = dict(said)
+        for feature, place in zip(part, part.in_wgs84(layers.frame), strict=True):
+            own = feature.properties.get(NAME)
+            closed = isinstance(own, dict) and own.get("closed") is True
+            pieces = list(place.geoms) if place.geom_type == "MultiPolygon" else [place]
+            for k, piece in enumerate(pieces):
+                if piece.geom_type == "Polygon" and not piece.is_empty:
+                    is_fence = feature.properties.get("kind") == FENCE
+                    found.append((not is_fence, -piece.area, f"{key.level}/{feature.id}/{k}", piece, closed))
+                else:
+                    lost += 1
+    context.drop("location items that are no polygons", lost, "datum.yaml has room for one fence")
+    if not found:
+        return None, known, False
+    found.sort(key=lambda row: row[:3])
+    context.drop("further location polygons", len(found) - 1, "datum.yaml has room for one fence")
+    fence = found[0][3]
+    context.drop("holes of the fence", len(fence.interiors), "a fence in datum.yaml is one ring")
+    return fence, known, found[0][4]
+
+
+def _size(document: Mapping[str, Any], layers: Layers, ring: Any, context: WriteContext) -> dict[str, Any]:
+    """gmapping as the source has it, with what it lacks from the extent of fence and data, in whole metres."""
+    said = document.get("gmapping")
+    size = dict(said) if isinstance(said, dict) else {}
+    lacking = [key for key in ("xmin", "xmax", "ymin", "ymax") if key not in size]
+    if not lacking:
+        return size
+    extent = _extent(layers, ring)
+    if extent is None:
+        why, extent = "the template's size: nothing tells the extent", (-HALF_MAP, -HALF_MAP, HALF_MAP, HALF_MAP)
+    else:
+        why = "the extent of the fence and the data, whole metres"
+    west, south, east, north = extent
+    made = {"xmin": math.floor(west), "xmax": math.ceil(east), "ymin": math.floor(south), "ymax": math.ceil(north)}
+    for key in lacking:
+        size[key] = made[key]
+    context.fill("gmapping", {key: size[key] for key in lacking}, why)
+    return size
+
+
+def _extent(layers: Layers, ring: Any) -> tuple[float, float, float, float] | None:
+    """West, south, east, north of everything that is there, in local metres."""
+    frame = layers.frame
+    boxes: list[NDArray[np.float64]] = []
+    if ring is not None and frame is not None:
+        boxes.append(frame.to_local(ring))
+    for part in layers.parts.values():
+        if isinstance(part, Features) and len(part):
+            boxes.append(shapely.get_coordinates(part.in_local(frame)))
+        elif isinstance(part, OccupancyGrid):
+            boxes.append(np.asarray(part.corners(), np.float64))
+    everything = np.concatenate([np.empty((0, 2)), *boxes])
+    if not len(everything):
+        return None
+    west, south = everything.min(axis=0).tolist()
+    east, north = everything.max(axis=0).tolist()
+    return west, south, east, north
+
+
+def _mapviz(document: Mapping[str, Any], datum: Datum, old: tuple[Any, Any], context: WriteContext) -> str:
+    """mapviz' origins: those that stood at the source's datum stand at the datum."""
+    said = document.get("mapviz_initialize_origin")
+    if said is None:
+        made: dict[str, Any] = {"name": "dont_change_this", "latitude": None, "longitude": None}
+        made |= {"altitude": MAPVIZ_ALTITUDE, "heading": 0.0}
+        said = {"local_xy_origins": [made]}
+        context.fill("mapviz_initialize_origin", "one origin at the datum", "no source has it")
+        old = (None, None)
+    origins = said.get("local_xy_origins") if isinstance(said, dict) else None
+    if not isinstance(said, dict) or not isinstance(origins, list):
+        return _yaml.block(said, 0)
+    moved = []
+    for origin in origins:
+        if isinstance(origin, dict) and (origin.get("latitude"), origin.get("longitude")) == old:
+            moved.append({**origin, "latitude": datum.latitude, "longitude": datum.longitude})
+        else:
+            moved.append(origin)
+    return _yaml.block({**said, "local_xy_origins": moved}, 0)
+
+
+def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) -> str:
+    """navsat_transform_node's parameters, its datum made from ours."""
+    said = document.get("navsat_transform_node")
+    navsat = dict(said) if isinstance(said, dict) else {}
+    lacking = {key: value for key, value in NAVSAT.items() if key not in navsat}
+    if lacking:
+        context.fill("navsat_transform_node", lacking, "no source has it")
+    listed = navsat.pop("datum", None)
+    yaw: Any = listed[2] if isinstance(listed, list) and len(listed) > 2 else None
+    more = listed[3:] if isinstance(listed, list) else []
+    # The source's own yaw where it says the same: it may be several turns, and has digits that degrees would lose.
+    if isinstance(yaw, bool) or not isinstance(yaw, (int, float)) or _heading(yaw) != datum.heading:
+        yaw = -math.radians(datum.heading) + 0.0
+    values = [_text(datum.latitude), _text(datum.longitude), *map(_yaml.text, [yaw, *more])]
+    return _ordered({**NAVSAT, **navsat}, 2, tuple(NAVSAT)) + f"  datum: [{', '.join(values)}]\n"
+
+
+def _ordered(values: Mapping[str, Any], column: int, first: Sequence[str]) -> str:
+    """A mapping's text: these keys in this order, then the others sorted."""
+    out = [_yaml.mapping({key: values[key]}, column) for key in first if key in values]
+    rest = {key: value for key, value in values.items() if key not in first}
+    return "".join(out) + (_yaml.mapping(rest, column) if rest else "")
+
+
+_KEY = re.compile(rb"(?m)^datum_latitude\s*:")
+
+
+def detect(name: str, data: bytes) -> bool:
+    """YAML with the datum's latitude and longitude at its top level."""
+    yaml_name = name.lower().endswith((".yaml", ".yml"))
+    return yaml_name and bool(_KEY.search(data)) and b"datum_longitude" in data
+
+
+register(
+    Format(
+        name=NAME,
+        title="Datum and GNSS fence (environment_template)",
+        files=("datum.yaml",),
+        media_types=("application/yaml",),
+        carries=frozenset({"location"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"location"}),), anchor="wgs84", datum=True),
+        family=NAME,
+        rank=60,
+        extensions=(".yaml", ".yml"),
+    )
+)
