@@ -1,0 +1,1022 @@
+"""What KML and KMZ share: reading KML into layers, and how its coordinates and our own words are spelled in it.
+
+Source: OGC KML 2.2/2.3 and Google's ``gx`` extension. Positions are longitude, latitude[, altitude]: degrees WGS 84,
+metres.
+
+**What is kept of a drawing.** A placemark or overlay is one object. ``properties.kml`` keeps where it stood and what
+the canonical words cannot say:
+
+``document``  name of the file it came from; ``Features.document["kml"]["documents"][name]`` has the rest of that file
+``place``     its number in that file
+``xml``       the element as text, with slots instead of what the canonical words say: ``<?n?>`` the name, ``<?c?>`` a
+              list of coordinates, ``<?d NAME?>`` a plain value of its ExtendedData, which stands in ``properties``
+              under its own name (or under ``properties.kml.data``, where the name means something else here)
+``shape``     the geometry that the coordinate slots belong to; without it ``xml`` holds the geometry itself
+
+A document is ``{"xml": …}``: the file without its objects, ``<?items N?>`` where those from number N on stood, and
+``<?end?>`` where more can be added. Slots are processing instructions, which a reader never lets in, so no text of a
+file can pass for one.
+
+**Our own words.** Items of other layers and format families carry in their ExtendedData: ``layer``, ``id``, every
+property under its own name, ``level`` and ``part`` where they are not the usual ones, and ``local``: the exact metres
+of an item that is anchored in the local frame. Values are texts, or JSON where they are no texts. What such items have
+in common stands in the ExtendedData of their folder, marked by ``fleetmap``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import orjson
+import shapely
+from lxml import etree
+from numpy.typing import NDArray
+
+from app.errors import Problem, UnreadableFile
+from app.formats import ReadContext, _image, _xml
+from app.model.features import MAX_ID, NO_GEOMETRY, Features, unique_ids
+from app.model.frame import MAX_METRES, Datum, Level
+from app.model.geodesy import LocalFrame, local_frame
+from app.model.grid import OccupancyGrid
+from app.model.layers import MAP, NETWORK, SITE, VECTOR_LAYERS, ZONES, Layers, Part, PartKey
+
+FAMILY = "kml"
+MAIN = "map.kml"
+
+CONTAINERS = frozenset({"kml", "Document", "Folder"})
+OVERLAYS = frozenset({"GroundOverlay", "ScreenOverlay", "PhotoOverlay"})
+ITEMS = frozenset({"Placemark", "NetworkLink"}) | OVERLAYS
+SIMPLE = frozenset({"Point", "LineString", "LinearRing", "Polygon"})
+GEOMETRIES = SIMPLE | {"MultiGeometry", "Model", "Track", "MultiTrack"}
+
+MARK = "fleetmap"
+STYLE = "fleetmap-"
+USUAL_PART: Mapping[str, str] = {"topology": NETWORK, "location": SITE, "zones": ZONES, "occupancy": MAP, "objects": ""}
+OWN_WORDS = frozenset({"layer", "level", "part", "id", "local", "geometry", "more", MARK})
+"""Names in ExtendedData that place an item; a property of such a name travels in ``more``."""
+
+RESERVED = OWN_WORDS | {
+    *("kind", "name", "source", "target", "orientation", "action", "speed_limit", "width", "value", "expires"),
+    *("pose", "size", "datum", "drawn_from", "data", "documents", "tags", "properties", "style", "kml", "kmz", "osm"),
+    *("geojson", "tmap", "tmap2", "openrmf", "rmf_nav_graph", "gazebo", "navgraph", "nav2_route", "lif", "lanelet2"),
+    *("environment", "occupancy_grid", "octomap", "satellite", "pcd", "ply", "las", "prm", "ffr_network"),
+}
+"""Property names that mean something to us: a drawing's own value of that name stays under ``properties.kml.data``."""
+
+COORDINATES, NAME, END = "<?c?>", "<?n?>", "<?end?>"
+SLOT = re.compile(r"<\?(c|n|d ([^?]*))\?>")
+
+# Marks that stand for slots while libxml2 holds the tree (it takes no control characters). Private characters of the
+# last plane; a file that uses them itself is refused, since its slots could not be told apart.
+_M_ITEM, _M_COORDINATES, _M_NAME, _M_DATA, _M_END = (chr(0x10FF00 + k) for k in range(5))
+
+_NUMBER_BYTES = np.zeros(256, bool)
+_NUMBER_BYTES[list(b"0123456789+-.eE")] = True
+_BLANK_BYTES = np.zeros(256, bool)
+_BLANK_BYTES[list(b" \t\r\n")] = True
+
+OVERLAY_TOLERANCE = 1e-11
+MOVED = 1e-8
+"""Degrees (a millimetre): an item of ours whose drawn place differs more from its exact metres has been moved."""
+
+
+def local_name(element: etree._Element) -> str:
+    """The tag without its namespace."""
+    tag: str = element.tag
+    return tag.rpartition("}")[2]
+
+
+def child(element: etree._Element, name: str) -> etree._Element | None:
+    """The first child of this name, in any namespace: KML is found in five of them, and without one."""
+    found: etree._Element | None = element.find("{*}" + name)
+    return found
+
+
+def child_text(element: etree._Element, name: str) -> str:
+    """The stripped text of the first child of this name, else an empty text."""
+    found = child(element, name)
+    return "" if found is None else (found.text or "").strip()
+
+
+# --- coordinates ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Sequences:
+    """k lists of coordinates. points: float64 [n, 3], altitude 0 where none is given. start: int [k + 1], where each
+    list begins. odd: bool [k], True where a text is not plain tuples of two or three numbers (its list is empty).
+    """
+
+    points: NDArray[np.float64]
+    start: NDArray[np.int64]
+    odd: NDArray[np.bool_]
+
+
+def parse_coordinates(texts: Sequence[str]) -> Sequences:
+    """Coordinate texts -> numbers, all at once; what is not plain is marked, not refused."""
+    joined = ";".join(texts).encode()
+    raw = np.frombuffer(joined + b";", np.uint8)
+    comma, cut = raw == ord(","), raw == ord(";")
+    blank = _BLANK_BYTES[raw] | cut
+    odd = np.zeros(len(texts), bool)
+    cuts = np.flatnonzero(cut)
+    if len(cuts) != len(texts):
+        return _one_by_one(texts)
+    inside = ~blank
+    begins = np.flatnonzero(inside & np.concatenate([[True], blank[:-1]]))
+    text_of = np.searchsorted(cuts, begins)
+    commas = np.flatnonzero(comma)
+    token_of = np.searchsorted(begins, commas, "right") - 1
+    size = np.bincount(token_of, minlength=len(begins)) + 1
+    odd[text_of[(size != 2) & (size != 3)]] = True
+    # A comma needs a number on either side; other characters are no numbers.
+    after = raw[np.minimum(commas + 1, len(raw) - 1)]
+    before = raw[np.maximum(commas - 1, 0)]
+    odd[np.searchsorted(cuts, commas[~(_NUMBER_BYTES[after] & _NUMBER_BYTES[before])])] = True
+    odd[np.searchsorted(cuts, np.flatnonzero(~(_NUMBER_BYTES[raw] | comma | blank)))] = True
+    if odd.any():
+        plain = parse_coordinates(["" if bad else t for t, bad in zip(texts, odd.tolist(), strict=True)])
+        return Sequences(plain.points, plain.start, odd | plain.odd)
+    try:
+        values = np.array(list(map(float, joined.translate(bytes.maketrans(b",;", b"  ")).split())), np.float64)
+    except ValueError:
+        return _one_by_one(texts)
+    points = np.zeros((len(begins), 3))
+    first = np.concatenate([[0], np.cumsum(size)[:-1]]).astype(np.int64)
+    points[:, 0], points[:, 1] = values[first], values[first + 1]
+    deep = size == 3
+    points[deep, 2] = values[first[deep] + 2]
+    start = np.searchsorted(text_of, np.arange(len(texts) + 1))
+    return Sequences(points, start, odd)
+
+
+def _one_by_one(texts: Sequence[str]) -> Sequences:
+    """The same where one text spoils the others."""
+    if len(texts) == 1:
+        return Sequences(np.empty((0, 3)), np.zeros(2, np.int64), np.ones(1, bool))
+    each = [parse_coordinates([t]) for t in texts]
+    start = np.concatenate([[0], np.cumsum([len(s.points) for s in each])])
+    return Sequences(np.concatenate([s.points for s in each]), start, np.concatenate([s.odd for s in each]))
+
+
+_SPACED_COMMA = re.compile(r"[ \t\r\n]*,[ \t\r\n]*")
+_PLAIN_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?\Z")
+
+
+def lenient_tuples(text: str, line: int | None) -> list[tuple[float, float, float]]:
+    """Coordinates as Google Earth reads them: blanks around commas, a stray comma, and a,b,c,d,e,f without blanks.
+
+    Tuples of one number are left out. Raises UnreadableFile for what is no number.
+    """
+    out = []
+    for token in _SPACED_COMMA.sub(",", text).split():
+        parts = [p for p in token.split(",") if p]
+        for p in parts:
+            if not _PLAIN_NUMBER.match(p):
+                raise UnreadableFile(f"{p[:40]!r} is not a coordinate", [_at(f"{p[:40]!r} is not a number", line)])
+        values = [float(p) for p in parts]
+        step = 3 if len(values) % 3 == 0 else len(values) if len(values) == 2 else 0
+        if step:
+            out += [_point(values[k : k + step], line) for k in range(0, len(values), step)]
+    return out
+
+
+def _point(values: Sequence[float], line: int | None) -> tuple[float, float, float]:
+    x, y, z = (*values, 0.0, 0.0)[:3]
+    if not (abs(x) <= 180.0 and abs(y) <= 90.0 and math.isfinite(z)):
+        raise UnreadableFile(f"the coordinates {x:g},{y:g} are not on earth", [_off_earth(x, y, line)])
+    return x, y, z
+
+
+def _off_earth(x: float, y: float, line: int | None) -> Problem:
+    return _at(f"longitude {x:g}, latitude {y:g}: must be finite, within ±180 and ±90 degrees", line)
+
+
+def _at(problem: str, line: int | None) -> Problem:
+    return Problem(problem, line=line)
+
+
+def _flat(points: Sequence[tuple[float, float, float]]) -> NDArray[np.float64]:
+    """float64 [n, 2], or [n, 3] where any altitude is not 0."""
+    array = np.array(points, np.float64).reshape(-1, 3)
+    return array if array[:, 2].any() else array[:, :2]
+
+
+def _line(points: Sequence[tuple[float, float, float]]) -> Any:
+    """A line; one point is a point, none is nothing."""
+    if len(points) > 1:
+        return shapely.linestrings(_flat(points))
+    return shapely.points(_flat(points)[0]) if points else NO_GEOMETRY
+
+
+def _area(rings: Sequence[Sequence[tuple[float, float, float]]]) -> Any:
+    """A polygon from its rings, closed if they are open; an outer ring without area is a line or a point."""
+    if not rings:
+        return NO_GEOMETRY
+    closed = [[*r, r[0]] if r and r[0] != r[-1] else list(r) for r in rings]
+    if len(closed[0]) < 4:
+        return _line(rings[0])
+    deep = any(p[2] for r in closed for p in r)
+    make = [shapely.linearrings(np.array(r)[:, : 3 if deep else 2]) for r in closed if len(r) >= 4]
+    return shapely.polygons(make[0], holes=make[1:] or None)
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    """Several geometries as one: Multi… where they are of one type."""
+    flat = list(parts)
+    while any(p.geom_type.startswith(("Multi", "Geometry")) for p in flat):
+        flat = [q for p in flat for q in shapely.get_parts(p)]
+    flat = [p for p in flat if not p.is_empty]
+    if not flat:
+        return NO_GEOMETRY
+    types = {p.geom_type for p in flat}
+    make = {"Point": shapely.multipoints, "LineString": shapely.multilinestrings, "Polygon": shapely.multipolygons}
+    deep = any(p.has_z for p in flat)
+    flat = [shapely.force_3d(p) if deep and not p.has_z else p for p in flat]
+    if len(types) == 1 and (one := types.pop()) in make:
+        return make[one](flat)
+    return shapely.geometrycollections(flat)
+
+
+def read_geometry(g: etree._Element) -> Any:
+    """One geometry element, whatever oddity it has; empty ones give NO_GEOMETRY. Raises UnreadableFile."""
+    name = local_name(g)
+    if name in ("Point", "LineString", "LinearRing"):
+        points = _own_tuples(g)
+        return _line(points[:1] if name == "Point" else points)
+    if name == "Polygon":
+        rings = [
+            _own_tuples(r) for side in ("outer", "inner") for r in g.iterfind(f"{{*}}{side}BoundaryIs/{{*}}LinearRing")
+        ]
+        return _area(rings)
+    if name == "Track":
+        texts = [(c, (c.text or "").split()) for c in g.iterchildren("{*}coord")]
+        return _line([_point(_floats(t, c.sourceline), c.sourceline) for c, t in texts if len(t) in (2, 3)])
+    if name == "Model":
+        spot = child(g, "Location")
+        texts3 = [] if spot is None else [child_text(spot, w) for w in ("longitude", "latitude", "altitude")]
+        if len(texts3) < 3 or not (texts3[0] and texts3[1]):
+            return NO_GEOMETRY
+        return _line([_point(_floats([t or "0" for t in texts3], g.sourceline), g.sourceline)])
+    inner = [read_geometry(c) for c in g if isinstance(c.tag, str) and local_name(c) in GEOMETRIES]
+    return _joined(inner)
+
+
+def _own_tuples(g: etree._Element) -> list[tuple[float, float, float]]:
+    return [t for c in g.iterchildren("{*}coordinates") for t in lenient_tuples(c.text or "", c.sourceline)]
+
+
+def _floats(texts: Sequence[str], line: int | None) -> list[float]:
+    for t in texts:
+        if not _PLAIN_NUMBER.match(t.strip()):
+            raise UnreadableFile(f"{t[:40]!r} is not a number", [_at(f"{t[:40]!r} is not a number", line)])
+    return [float(t) for t in texts]
+
+
+def item_geometry(element: etree._Element) -> Any:
+    """The geometry of a placemark or overlay, of any shape. Raises UnreadableFile."""
+    if local_name(element) == "GroundOverlay":
+        return overlay_footprint(element)
+    found = [c for c in element if isinstance(c.tag, str) and local_name(c) in GEOMETRIES]
+    if len(found) == 1:
+        return read_geometry(found[0])
+    shapes = [s for s in map(read_geometry, found) if not s.is_empty]
+    return shapes[0] if len(shapes) == 1 else _joined(shapes)
+
+
+def overlay_footprint(element: etree._Element) -> Any:
+    """Where a GroundOverlay lies: its gx:LatLonQuad, else its LatLonBox turned about its middle (counter-clockwise)."""
+    quad, box = child(element, "LatLonQuad"), child(element, "LatLonBox")
+    if quad is not None:
+        corners = _own_tuples(quad)
+        return shapely.polygons([p[:2] for p in corners]) if len(corners) == 4 else NO_GEOMETRY
+    if box is None:
+        return NO_GEOMETRY
+    texts = [child_text(box, side) for side in ("west", "south", "east", "north", "rotation")]
+    if not all(texts[:4]):
+        return NO_GEOMETRY
+    west, south, east, north, turn = _floats([*texts[:4], texts[4] or "0"], box.sourceline)
+    for x, y in ((west, south), (east, north)):
+        if not (abs(x) <= 360.0 and abs(y) <= 90.0):
+            raise UnreadableFile(f"an overlay's corner {x:g},{y:g} is not on earth", [_off_earth(x, y, box.sourceline)])
+    if not math.isfinite(turn):
+        raise UnreadableFile("an overlay's rotation is not finite", [_at("rotation is not finite", box.sourceline)])
+    if east < west:
+        east += 360.0
+    corners2 = np.array([[west, south], [east, south], [east, north], [west, north]])
+    angle = math.radians(turn)
+    if angle:
+        middle = corners2.mean(axis=0)
+        shrink = max(math.cos(math.radians(middle[1])), 1e-6)
+        u, v = (corners2 - middle).T * np.array([[shrink], [1.0]])
+        c, s = math.cos(angle), math.sin(angle)
+        corners2 = middle + np.stack([(c * u - s * v) / shrink, s * u + c * v], axis=1)
+    return _within_earth(shapely.polygons(corners2))
+
+
+def _within_earth(shape: Any) -> Any:
+    """A footprint that crosses the antimeridian as two, one on either side."""
+    west, _, east, _ = shape.bounds
+    if west >= -180.0 and east <= 180.0:
+        return shapely.intersection(shape, shapely.box(-180.0, -90.0, 180.0, 90.0)) if shape.bounds[3] > 90 else shape
+    pieces = []
+    for shift in (-360.0, 0.0, 360.0):
+        moved = shapely.transform(shape, lambda p, by=shift: p + np.array([by, 0.0]))
+        piece = shapely.intersection(moved, shapely.box(-180.0, -90.0, 180.0, 90.0))
+        if piece.area > 0.0:
+            pieces.append(piece)
+    return pieces[0] if len(pieces) == 1 else _joined(pieces)
+
+
+# --- values -----------------------------------------------------------------------------------------------------------
+
+_ILLEGAL = "\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff"
+ILLEGAL = re.compile(f"[{_ILLEGAL}]")
+"""Characters that XML 1.0 cannot hold."""
+
+_PLAIN = re.compile(rf"(?!(?:true|false|null)\Z)[^\s\-0-9{{\[\"{_ILLEGAL}][^{_ILLEGAL}]*\Z")
+_ESCAPES = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", "\r": "&#13;"})
+
+
+def escape(text: str) -> str:
+    """A text for XML content and (with ``quoted``) attributes; what XML cannot hold becomes U+FFFD."""
+    return ILLEGAL.sub("\ufffd", text).translate(_ESCAPES)
+
+
+def quoted(text: str) -> str:
+    """A text for an attribute in double quotes."""
+    return escape(text).replace('"', "&quot;").replace("\n", "&#10;").replace("\t", "&#9;")
+
+
+def spell(value: Any) -> str:
+    """A property's value as an escaped text: texts as they are where that is unmistakable, all else as JSON."""
+    if isinstance(value, str):
+        if _PLAIN.match(value):
+            return value.translate(_ESCAPES)
+        value = value.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+    text = orjson.dumps(value, option=orjson.OPT_SORT_KEYS).decode()
+    if ILLEGAL.search(text):
+        text = ILLEGAL.sub(lambda m: f"\\u{ord(m[0]):04x}", text)
+    return text.translate(_ESCAPES)
+
+
+def unspell(text: str) -> Any:
+    """The value that ``spell`` wrote; a text that is no JSON stays one."""
+    if text[:1] in _JSON_STARTS or text in ("true", "false", "null"):
+        try:
+            return orjson.loads(text)
+        except orjson.JSONDecodeError:
+            return text
+    return text
+
+
+_JSON_STARTS = frozenset('-0123456789{["')
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Own:
+    """Items of ours on their way back to one part."""
+
+    ids: list[str] = field(default_factory=list)
+    geometry: list[Any] = field(default_factory=list)
+    properties: list[dict[str, Any]] = field(default_factory=list)
+    local: list[Any] = field(default_factory=list)
+    document: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class _Item:
+    """A placemark or overlay while its tree is read."""
+
+    element: etree._Element
+    data: list[tuple[str, etree._Element]] = field(default_factory=list)
+    geometries: list[etree._Element] = field(default_factory=list)
+    sequences: list[tuple[str, int]] = field(default_factory=list)
+    shape: str = ""
+
+
+def read_kml(
+    data: bytes, context: ReadContext, name: str, pictures: Mapping[str, bytes], entry: str | None = None
+) -> tuple[Layers, set[str]]:
+    """KML -> layers, and the names of the pictures that became grids.
+
+    name: of the file, under which its document is kept. pictures: what relative references may mean (KMZ). entry: the
+    name of this document inside its archive. Raises UnreadableFile with the line.
+    """
+    root = _xml.parse(data, context.limits, remove_blank_text=True)
+    if local_name(root) not in CONTAINERS | ITEMS:
+        raise UnreadableFile(
+            f"the root element is <{local_name(root)}>: KML starts with <kml>",
+            [Problem(f"<{local_name(root)}> is not KML", line=root.sourceline)],
+        )
+    reader = _Reader(context, pictures)
+    reader.read(root, name, entry)
+    return reader.layers(), reader.used
+
+
+class _Reader:
+    """One file. Its documents (ours may hold several) are read one after the other into shared columns."""
+
+    def __init__(self, context: ReadContext, pictures: Mapping[str, bytes]) -> None:
+        self.context = context
+        self.pictures = pictures
+        self.used: set[str] = set()
+        self.datum: Datum | None = None
+        self.levels: dict[str, float] = {}
+        self.own: dict[PartKey, _Own] = {}
+        self.grids: dict[PartKey, OccupancyGrid] = {}
+        self.columns: dict[str, list[tuple[list[str], list[Any], list[dict[str, Any]]]]] = {}
+        self.documents: dict[str, dict[str, Any]] = {}
+
+    def read(self, root: etree._Element, name: str, entry: str | None) -> None:
+        """A document, and those that we have put inside it."""
+        marks = self._marks(root)
+        for element, words in marks:
+            if words.get(MARK) == "document" and element is not root and element.getparent() is not None:
+                inner = words.get("document") or name
+                self._detach(element)
+                self._read_one(element, inner, words.get("entry"), words.get("level") or self.context.level, [])
+        ours = [(e, w) for e, w in marks if w.get(MARK) != "document"]
+        self._read_one(root, name, entry, self.context.level, ours)
+
+    def _marks(self, root: etree._Element) -> list[tuple[etree._Element, dict[str, str]]]:
+        """Containers that carry our mark, innermost last, with their words."""
+        out = []
+        for extended in root.iter("{*}ExtendedData"):
+            parent = extended.getparent()
+            if parent is not None and local_name(parent) in CONTAINERS:
+                words = {n: v.text or "" for n, v in _values(extended)}
+                if MARK in words:
+                    out.append((parent, words))
+        return out
+
+    def _detach(self, element: etree._Element) -> None:
+        """Take a document of its own out of ours: it becomes a ``kml`` root again."""
+        for added in (child(element, "ExtendedData"), child(element, "name")):
+            if added is not None:
+                element.remove(added)
+        namespace = element.tag.rpartition("}")[0]
+        element.getparent().remove(element)
+        element.tag = f"{namespace}}}kml" if namespace else "kml"
+
+    def _read_one(
+        self,
+        root: etree._Element,
+        name: str,
+        entry: str | None,
+        level: str,
+        ours: list[tuple[etree._Element, dict[str, str]]],
+    ) -> None:
+        items = _items(root)
+        parsed = self._sequences(items)
+        _check_places(items, parsed)
+        mine, theirs = [], []
+        for item in items:
+            words = dict(_spoken(item.data))
+            if words.get("layer") in USUAL_PART:
+                mine.append((item, words))
+            else:
+                theirs.append(item)
+        self._take(mine, parsed)
+        whole = self._remove_ours(root, ours)
+        if theirs or not whole:
+            self._keep(root, theirs, parsed, name, entry, level)
+
+    # --- our own words ---
+
+    def _key(self, words: Mapping[str, str], layer: str) -> PartKey:
+        part = words.get("part") or USUAL_PART[layer] or FAMILY
+        return PartKey(layer, words.get("level") or self.context.level, part)  # type: ignore[arg-type]
+
+    def _take(self, mine: Sequence[tuple[_Item, dict[str, str]]], parsed: Sequences) -> None:
+        """Items of ours go back to their parts."""
+        geometry = _geometries([item for item, _ in mine], parsed)
+        metres = _metres([words.get("local") for _, words in mine], [item.element for item, _ in mine])
+        for (item, words), drawn, exact in zip(mine, geometry, metres, strict=True):
+            element = item.element
+            parent = element.getparent()
+            if parent is not None:
+                parent.remove(element)
+            layer = words["layer"]
+            title = child_text(element, "name")
+            if layer == "occupancy":
+                self._take_grid(element, words, title)
+                continue
+            properties: dict[str, Any] = {"name": title} if title else {}
+            for label, text in words.items():
+                if label not in OWN_WORDS:
+                    properties[label] = unspell(text)
+            if "more" in words and isinstance(more := unspell(words["more"]), dict):
+                properties |= more
+            if layer == "location" and properties.get("kind") == "datum" and "id" not in words:
+                self._take_datum(properties, element)
+                continue
+            shape = drawn
+            if words.get("geometry") == "GeometryCollection" and drawn.geom_type != "GeometryCollection":
+                shape = shapely.geometrycollections(list(shapely.get_parts(drawn)))
+            own = self.own.setdefault(self._key(words, layer), _Own())
+            own.ids.append(_usable(words.get("id") or title or local_name(element)))
+            own.geometry.append(shape)
+            own.properties.append(properties)
+            own.local.append(exact)
+
+    def _take_datum(self, properties: Mapping[str, Any], element: etree._Element) -> None:
+        wanted = ("latitude", "longitude", "altitude", "heading")
+        numbers = {n: properties[n] for n in wanted if isinstance(properties.get(n), int | float)}
+        if "latitude" not in numbers or "longitude" not in numbers:
+            reason = "the datum has no latitude and longitude"
+            raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)])
+        self.datum = Datum(**numbers)
+
+    def _take_grid(self, element: etree._Element, words: Mapping[str, str], title: str) -> None:
+        """A grid whose picture travels with the drawing (KMZ): the picture's palette index is the cell."""
+        icon = child(element, "Icon")
+        href = "" if icon is None else child_text(icon, "href")
+        label = words.get("part") or title or MAP
+        picture = self.pictures.get(href)
+        if picture is None:
+            self.context.warn(
+                "its picture is not here (it travels in KMZ only), so the grid is left out",
+                line=element.sourceline,
+                where=label,
+            )
+            return
+        said = {n: unspell(t) for n, t in words.items()}
+        image = _image.read_image(picture, self.context.limits)
+        if image.mode != "P":
+            raise UnreadableFile(f"{href} is no longer the picture of a grid: its colours have changed")
+        self.used.add(href)
+        origin = said.get("origin")
+        if not isinstance(origin, list) or "resolution" not in said:
+            reason = f"grid {label} has no resolution and origin"
+            raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)])
+        properties = said.get("properties")
+        self.grids[self._key(words, "occupancy")] = OccupancyGrid(
+            np.ascontiguousarray(np.asarray(image, np.uint8)[::-1]),
+            float(said["resolution"]),
+            tuple(float(v) for v in origin),  # type: ignore[arg-type]
+            said.get("mode", "trinary"),
+            float(said.get("occupied_thresh", 0.65)),
+            float(said.get("free_thresh", 0.196)),
+            bool(said.get("negate", False)),
+            properties if isinstance(properties, dict) else {},
+        )
+
+    def _remove_ours(self, root: etree._Element, ours: list[tuple[etree._Element, dict[str, str]]]) -> bool:
+        """Take out our folders and styles; True where nothing of anybody else is left in the file."""
+        for element, words in reversed(ours):
+            for extended in element.findall("{*}ExtendedData")[:1]:
+                element.remove(extended)
+            for style in element.findall("{*}Style"):
+                if style.get("id", "").startswith(STYLE):
+                    element.remove(style)
+            if words[MARK] == "part" and words.get("layer") in VECTOR_LAYERS:
+                level = words.get("level") or self.context.level
+                elevation = unspell(words.get("elevation", "0"))
+                if isinstance(elevation, int | float):
+                    self.levels[level] = float(elevation)
+                document = unspell(words.get("document", "{}"))
+                own = self.own.setdefault(self._key(words, words["layer"]), _Own())
+                own.document |= document if isinstance(document, dict) else {}
+            left = [c for c in element if local_name(c) not in ("name", "description", "visibility", "open")]
+            parent = element.getparent()
+            if left:
+                continue
+            if parent is None or (parent is root and local_name(root) == "kml" and len(root) == 1):
+                return True
+            parent.remove(element)
+        return False
+
+    # --- drawings ---
+
+    def _sequences(self, items: Sequence[_Item]) -> Sequences:
+        """Find the lists of coordinates of all items with a plain structure, and read them at once."""
+        texts: list[str] = []
+        for item in items:
+            if len(item.geometries) != 1 or local_name(item.element) == "GroundOverlay":
+                continue
+            found = _plain_sequences(item.geometries[0])
+            if found is None:
+                continue
+            item.shape = found[0]
+            for role, c in found[1]:
+                item.sequences.append((role, len(texts)))
+                texts.append(c.text or "")
+        if not texts:
+            return Sequences(np.empty((0, 3)), np.zeros(1, np.int64), np.zeros(0, bool))
+        parsed = parse_coordinates(texts)
+        count = np.diff(parsed.start)
+        least = {"P": 1, "L": 2, "R": 4}
+        closed = np.zeros(len(texts), bool)
+        full = count > 0
+        ends = parsed.points[parsed.start[1:][full] - 1]
+        closed[full] = (parsed.points[parsed.start[:-1][full]] == ends).all(axis=1)
+        counts, odd, closes = count.tolist(), parsed.odd.tolist(), closed.tolist()
+        strange = []
+        for item in items:
+            for role, k in item.sequences:
+                n = counts[k]
+                if odd[k] or n < least[role] or (role == "P" and n > 1) or (role == "R" and not closes[k]):
+                    item.shape = ""
+            if item.sequences and not item.shape:
+                strange.append(item.element)
+        if strange:
+            self.context.warn(
+                f"{len(strange)} geometries have coordinates that are not plain tuples, open rings or too few points; "
+                "they are read as Google Earth does and kept as they are",
+                line=strange[0].sourceline,
+                where=child_text(strange[0], "name")[:200] or None,
+            )
+        return parsed
+
+    def _keep(
+        self,
+        root: etree._Element,
+        items: list[_Item],
+        parsed: Sequences,
+        name: str,
+        entry: str | None,
+        level: str,
+    ) -> None:
+        """Somebody's drawing: its items become objects, the rest of it the document."""
+        geometry = _geometries(items, parsed)
+        ids, titles = _identify(items, self.context)
+        properties: list[dict[str, Any]] = []
+        types = shapely.get_type_id(geometry).tolist()
+        coordinates, names, values = 0, 0, 0
+        for k, item in enumerate(items):
+            element = item.element
+            title = titles[k]
+            own: dict[str, Any] = {"kind": _KINDS[types[k]] if local_name(element) not in OVERLAYS else "overlay"}
+            kept: dict[str, Any] = {"document": name, "place": k}
+            if title is not None:
+                tag, text = title
+                if text:
+                    own["name"] = text
+                tag.text = _M_NAME
+                names += 1
+            for label, value in item.data:
+                aside = label in RESERVED
+                (kept.setdefault("data", {}) if aside else own)[label] = value.text or ""
+                value.text = f"{_M_DATA}{quote(label)}{_M_DATA}"
+                values += 1
+            if item.shape:
+                kept["shape"] = item.shape
+                for c in item.geometries[0].iter("{*}coordinates"):
+                    c.text = _M_COORDINATES
+                    coordinates += 1
+            own["kml"] = kept
+            properties.append(own)
+        text = _serialised(root, [item.element for item in items])
+        found = [text.count(m) for m in (_M_NAME, _M_DATA, _M_COORDINATES, _M_END)]
+        pieces = text.split(_M_ITEM)
+        if found[:3] != [names, 2 * values, coordinates] or found[3] > 1 or len(pieces) != 2 * len(items) + 1:
+            reason = "the file uses private characters U+10FF00 to U+10FF04, which cannot be told from our own marks"
+            raise UnreadableFile(reason, [Problem(reason)])
+        for own, piece in zip(properties, pieces[1::2], strict=True):
+            own["kml"]["xml"] = _slots(piece, values)
+        skeleton = []
+        for k, piece in enumerate(pieces[0::2]):
+            skeleton.append(piece)
+            if k < len(items) and (piece or k == 0):
+                skeleton.append(f"<?items {k}?>")
+        document: dict[str, Any] = {"xml": "".join(skeleton).replace(_M_END, END)}
+        if entry is not None:
+            document["entry"] = entry
+        self.documents.setdefault(level, {})[name] = document
+        self.columns.setdefault(level, []).append((ids, list(geometry), properties))
+
+    # --- the result ---
+
+    def layers(self) -> Layers:
+        parts: dict[PartKey, Part] = dict(self.grids)
+        for level, columns in self.columns.items():
+            ids = unique_ids(i for c in columns for i in c[0])
+            shapes = [g for c in columns for g in c[1]]
+            geometry = np.empty(len(shapes), object)
+            geometry[:] = shapes
+            properties = [p for c in columns for p in c[2]]
+            document = {FAMILY: {"documents": self.documents[level]}}
+            key = PartKey("objects", level, FAMILY)
+            parts[key] = Features(tuple(ids), geometry, tuple(properties), np.zeros(len(ids), bool), document)
+        for key, own in self.own.items():
+            made = self._own_part(key, own)
+            known = parts.get(key)
+            parts[key] = _both(known, made) if isinstance(known, Features) else made
+        levels = tuple(Level(n, e) for n, e in sorted(self.levels.items(), key=lambda v: (v[1], v[0])))
+        return Layers(parts, self.datum, levels or (Level(self.context.level),))
+
+    def _own_part(self, key: PartKey, own: _Own) -> Features:
+        """Items of ours as they were: the exact metres where they were local, unless somebody has moved them."""
+        n = len(own.ids)
+        ids = unique_ids(own.ids)
+        if ids != own.ids:
+            again = [i for i, c in Counter(own.ids).items() if c > 1]
+            self.context.warn(
+                f"{len(again)} ids of {key.layer} are used twice: later ones got #2, #3 …", where=again[0]
+            )
+        geometry = np.empty(n, object)
+        geometry[:] = own.geometry
+        local = np.array([m is not None for m in own.local], bool)
+        where = np.flatnonzero(local)
+        if len(where):
+            metres = np.empty(len(where), object)
+            metres[:] = [own.local[k] for k in where]
+            geometry[where] = self._unmoved(geometry[where], metres)
+        return Features(tuple(ids), geometry, tuple(own.properties), local, own.document)
+
+    def _unmoved(self, drawn: NDArray[np.object_], metres: NDArray[np.object_]) -> NDArray[np.object_]:
+        """The exact metres, or what was drawn since, brought to metres."""
+        if self.datum is None:
+            return metres
+        frame: LocalFrame = local_frame(self.datum)
+        moved = ~shapely.equals_exact(frame.geometries_to_wgs84(metres), drawn, tolerance=MOVED)
+        moved &= ~shapely.is_empty(drawn)
+        if not moved.any():
+            return metres
+        out = metres.copy()
+        out[moved] = frame.geometries_to_local(drawn[moved])
+        self.context.warn(
+            f"{int(moved.sum())} items were moved in the drawing: their new places count, not their metres"
+        )
+        return out
+
+
+_KINDS = ("poi", "path", "path", "region", "poi", "path", "region", "region")
+
+
+def _both(a: Features, b: Features) -> Features:
+    """Objects that were drawn and objects that we had written, in one part."""
+    ids = unique_ids([*a.ids, *b.ids])
+    return Features(
+        tuple(ids),
+        np.concatenate([a.geometry, b.geometry]),
+        (*a.properties, *b.properties),
+        np.concatenate([a.local, b.local]),
+        {**b.document, **a.document},
+    )
+
+
+def _check_places(items: Sequence[_Item], parsed: Sequences) -> None:
+    """Refuse coordinates that are not on earth, with the line of their geometry."""
+    points = parsed.points
+    good = (np.abs(points[:, 0]) <= 180.0) & (np.abs(points[:, 1]) <= 90.0) & (np.abs(points[:, 2]) <= MAX_METRES)
+    if good.all():
+        return
+    at = int(np.flatnonzero(~good)[0])
+    sequence = int(np.searchsorted(parsed.start, at, "right")) - 1
+    owner = next((i for i in items if any(k == sequence for _, k in i.sequences)), None)
+    x, y, _ = points[at]
+    line = None if owner is None else owner.geometries[0].sourceline
+    raise UnreadableFile(f"the coordinates {x:g},{y:g} are not on earth", [_off_earth(x, y, line)])
+
+
+def _items(root: etree._Element) -> list[_Item]:
+    """The placemarks and overlays of the document: those that stand in nothing but containers (elsewhere, as in an
+    Update or in an element that nobody knows, they are part of what they stand in).
+    """
+    good: dict[etree._Element, bool] = {}
+
+    def contained(element: etree._Element) -> bool:
+        chain = []
+        while element is not None and element not in good:
+            chain.append(element)
+            if local_name(element) not in CONTAINERS:
+                good[element] = False
+                break
+            element = element.getparent()
+        answer = True if element is None else good[element]
+        good.update(dict.fromkeys(chain, answer))
+        return answer
+
+    items: list[_Item] = []
+    index: dict[etree._Element, _Item] = {}
+    for element in root.iter(*(f"{{*}}{name}" for name in sorted(ITEMS))):
+        parent = element.getparent()
+        if parent is None or contained(parent):
+            item = _Item(element)
+            items.append(item)
+            index[element] = item
+    for g in root.iter(*(f"{{*}}{name}" for name in sorted(GEOMETRIES))):
+        owner = index.get(g.getparent())
+        if owner is not None:
+            owner.geometries.append(g)
+    for extended in root.iter("{*}ExtendedData"):
+        owner = index.get(extended.getparent())
+        if owner is not None:
+            owner.data += _values(extended)
+    return items
+
+
+def _values(extended: etree._Element) -> list[tuple[str, etree._Element]]:
+    """The plain values of an ExtendedData: (name, element whose text is the value), the first of each name."""
+    out: dict[str, etree._Element] = {}
+    for entry in extended.iter("{*}Data", "{*}SimpleData"):
+        name = entry.get("name")
+        value = child(entry, "value") if local_name(entry) == "Data" else entry
+        if name and value is not None and not len(value) and name not in out:
+            out[name] = value
+    return list(out.items())
+
+
+def _spoken(data: Iterable[tuple[str, etree._Element]]) -> Iterator[tuple[str, str]]:
+    return ((name, value.text or "") for name, value in data)
+
+
+def _plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Element]]] | None:
+    """Shape and coordinate elements of a geometry without oddities of structure: ``P`` point, ``L`` line, ``A2`` area
+    of two rings, ``M…`` several of them; (role, element) in the order of the geometry's own coordinates.
+    """
+    name = local_name(g)
+    if name == "Polygon":
+        found = list(g.iter("{*}coordinates"))
+        for k, c in enumerate(found):
+            ring = c.getparent()
+            side = ring.getparent()
+            word = "outerBoundaryIs" if k == 0 else "innerBoundaryIs"
+            if len(c) or local_name(side) != word or side.getparent() is not g or len(ring.findall(c.tag)) != 1:
+                return None
+        return (f"A{len(found)}", [("R", c) for c in found]) if found else None
+    if name in SIMPLE:
+        found = g.findall("{*}coordinates")
+        if len(found) != 1 or len(found[0]) or len(list(g.iter("{*}coordinates"))) != 1:
+            return None
+        role = "P" if name == "Point" else "L"
+        return role, [(role, found[0])]
+    if name != "MultiGeometry":
+        return None
+    shape, out = "M", []
+    for c in g:
+        inner = _plain_sequences(c) if local_name(c) in SIMPLE else None
+        if inner is None:
+            return None
+        shape += inner[0]
+        out += inner[1]
+    return (shape, out) if out else None
+
+
+def _geometries(items: Sequence[_Item], parsed: Sequences) -> NDArray[np.object_]:
+    """All geometries, the plain ones made by the array. 3-D only where an altitude is not 0."""
+    out = np.full(len(items), NO_GEOMETRY, object)
+    wanted: dict[str, list[tuple[int, int]]] = {"P": [], "L": [], "A1": []}
+    for n, item in enumerate(items):
+        if item.shape in wanted:
+            wanted[item.shape].append((n, item.sequences[0][1]))
+        elif item.shape:
+            out[n] = _assembled(item, parsed)
+        else:
+            out[n] = item_geometry(item.element)
+    make: dict[str, Callable[..., Any]] = {
+        "P": lambda p, indices, out: out.__setitem__(slice(None), shapely.points(p)),
+        "L": lambda p, indices, out: shapely.linestrings(p, indices=indices, out=out),
+        "A1": lambda p, indices, out: out.__setitem__(
+            slice(None), shapely.polygons(shapely.linearrings(p, indices=indices))
+        ),
+    }
+    deep_points = np.concatenate([[0], np.cumsum(parsed.points[:, 2] != 0.0)])
+    for shape, rows in wanted.items():
+        if not rows:
+            continue
+        place, sequence = np.array(rows).T
+        begin, end = parsed.start[sequence], parsed.start[sequence + 1]
+        deep = deep_points[end] > deep_points[begin]
+        for mask, width in ((~deep, 2), (deep, 3)):
+            if not mask.any():
+                continue
+            size = (end - begin)[mask]
+            offset = np.repeat(begin[mask] - np.concatenate([[0], np.cumsum(size)[:-1]]), size)
+            points = parsed.points[np.arange(size.sum()) + offset, :width]
+            made = np.empty(len(size), object)
+            make[shape](points, np.repeat(np.arange(len(size)), size), made)
+            out[place[mask]] = made
+    return out
+
+
+def _assembled(item: _Item, parsed: Sequences) -> Any:
+    """A plain geometry of several lists: an area with holes, or a collection."""
+    lists = [parsed.points[parsed.start[k] : parsed.start[k + 1]] for _, k in item.sequences]
+    deep = any(p[:, 2].any() for p in lists)
+    rows = iter([p if deep else p[:, :2] for p in lists])
+    shapes = []
+    for word in re.findall(r"P|L|A\d+", item.shape):
+        if word == "P":
+            shapes.append(shapely.points(next(rows)[0]))
+        elif word == "L":
+            shapes.append(shapely.linestrings(next(rows)))
+        else:
+            rings = [shapely.linearrings(next(rows)) for _ in range(int(word[1:]))]
+            shapes.append(shapely.polygons(rings[0], holes=rings[1:] or None))
+    return _joined(shapes) if item.shape[0] == "M" else shapes[0]
+
+
+def _usable(text: str) -> str:
+    """A text as an id: printable and not too long."""
+    clean = "".join(c if c.isprintable() else " " for c in text).strip()
+    return clean[: MAX_ID - 12] or "_"
+
+
+def _identify(
+    items: Sequence[_Item], context: ReadContext
+) -> tuple[list[str], list[tuple[etree._Element, str] | None]]:
+    """Ids (the id attribute where it is the only one of its kind, else the name) and (element, text) of the names."""
+    attributes = [
+        e.get("id") or next((v for a, v in e.attrib.items() if a.endswith("}id")), "") if e.attrib else ""
+        for e in (item.element for item in items)
+    ]
+    counts = Counter(attributes)
+    titles: list[tuple[etree._Element, str] | None] = []
+    ids = []
+    for item, attribute in zip(items, attributes, strict=True):
+        tag = child(item.element, "name")
+        title = None if tag is None or len(tag) else (tag, (tag.text or "").strip())
+        titles.append(title)
+        if attribute and counts[attribute] == 1:
+            ids.append(_usable(attribute))
+        else:
+            ids.append(_usable(title[1] if title and title[1] else attribute or local_name(item.element)))
+    again = [n for n, c in Counter(t[1] for t in titles if t and t[1]).items() if c > 1]
+    if again:
+        others = f" and {len(again) - 1} more" if len(again) > 1 else ""
+        context.warn(f"several placemarks are called {again[0]!r}{others}; all are kept", where=again[0][:200])
+    return ids, titles
+
+
+def _serialised(root: etree._Element, items: Sequence[etree._Element]) -> str:
+    """The tree as text, with a mark before and behind each item, and one where more can be added."""
+    top = [c for c in root if local_name(c) in CONTAINERS | ITEMS]
+    if local_name(root) == "kml" and len(top) == 1 and local_name(top[0]) in CONTAINERS:
+        last = top[0][-1] if len(top[0]) else None
+        if last is None:
+            top[0].text = (top[0].text or "") + _M_END
+        else:
+            last.tail = (last.tail or "") + _M_END
+    for element in items:
+        before, parent = element.getprevious(), element.getparent()
+        if before is not None:
+            before.tail = (before.tail or "") + _M_ITEM
+        elif parent is not None:
+            parent.text = (parent.text or "") + _M_ITEM
+        if parent is not None:
+            element.tail = _M_ITEM + (element.tail or "")
+    text: str = etree.tostring(root, encoding="unicode")
+    return f"{_M_ITEM}{text}{_M_ITEM}" if items and items[0] is root else text
+
+
+def _slots(xml: str, values: int) -> str:
+    xml = xml.replace(_M_NAME, NAME).replace(_M_COORDINATES, COORDINATES)
+    return re.sub(f"{_M_DATA}([^{_M_DATA}]*){_M_DATA}", r"<?d \1?>", xml) if values and _M_DATA in xml else xml
+
+
+def _metres(texts: Sequence[str | None], elements: Sequence[etree._Element]) -> list[Any]:
+    """The exact coordinates of local items (None: not local): nested JSON lists, of a point, a line or an area, or a
+    GeoJSON geometry. Points and lines are made all at once.
+    """
+    out: list[Any] = [None] * len(texts)
+    points: list[tuple[int, Any]] = []
+    lines: list[tuple[int, Any]] = []
+    for k, text in enumerate(texts):
+        if text is None:
+            continue
+        try:
+            value = orjson.loads(text)
+            if isinstance(value, dict):
+                out[k] = shapely.from_geojson(orjson.dumps(value))
+            elif isinstance(value[0], int | float):
+                points.append((k, (len(value), value)))
+            elif isinstance(value[0][0], int | float):
+                lines.append((k, (len(value[0]), value)))
+            else:
+                rings = [shapely.linearrings(r) for r in value]
+                out[k] = shapely.polygons(rings[0], holes=rings[1:] or None)
+        except (ValueError, TypeError, LookupError, shapely.errors.ShapelyError) as error:
+            raise _no_metres(elements[k]) from error
+    for width in (2, 3):
+        dots = [(k, v) for k, (w, v) in points if w == width]
+        if dots:
+            for (k, _), made in zip(dots, shapely.points(np.array([v for _, v in dots], np.float64)), strict=True):
+                out[k] = made
+        strings = [(k, v) for k, (w, v) in lines if w == width and len(v) > 1]
+        if strings:
+            index = np.repeat(np.arange(len(strings)), [len(v) for _, v in strings])
+            flat = np.array([p for _, v in strings for p in v], np.float64).reshape(-1, width)
+            for (k, _), made in zip(strings, shapely.linestrings(flat, indices=index), strict=True):
+                out[k] = made
+    for k, text in enumerate(texts):
+        if text is not None and out[k] is None:
+            raise _no_metres(elements[k])
+    return out
+
+
+def _no_metres(element: etree._Element) -> UnreadableFile:
+    reason = "the local coordinates of an item are not [x, y], a list of them, or a GeoJSON geometry"
+    return UnreadableFile(reason, [Problem(reason, line=element.sourceline)])

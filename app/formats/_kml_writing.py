@@ -1,0 +1,632 @@
+"""Writing KML: the drawings that were uploaded as they were, and everything else in our own words (see ``_kml``)."""
+
+from __future__ import annotations
+
+import bisect
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import orjson
+import shapely
+from lxml import etree
+from numpy.typing import NDArray
+
+from app.formats import WriteContext, _image, _text
+from app.formats._kml import (
+    COORDINATES,
+    END,
+    FAMILY,
+    GEOMETRIES,
+    MARK,
+    NAME,
+    OWN_WORDS,
+    SLOT,
+    STYLE,
+    USUAL_PART,
+    child,
+    escape,
+    item_geometry,
+    local_name,
+    quoted,
+    spell,
+)
+from app.model.features import Features, Properties
+from app.model.frame import GROUND
+from app.model.geodesy import LocalFrame
+from app.model.grid import OccupancyGrid
+from app.model.layers import Layer, Layers, PartKey
+
+KML = "http://www.opengis.net/kml/2.2"
+GX = "http://www.google.com/kml/ext/2.2"
+ATOM = "http://www.w3.org/2005/Atom"
+HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
+_NAMESPACES = f'xmlns="{KML}" xmlns:gx="{GX}" xmlns:kml="{KML}" xmlns:atom="{ATOM}"'
+
+_SAME_PLACE = 1e-10
+"""Degrees: a geometry that differs less from what the kept element says has not been edited (coordinates are printed
+to 1e-12)."""
+
+_COLOURS = {
+    "node": "<IconStyle><color>ff00a5ff</color><scale>0.6</scale><Icon><href>"
+    "http://maps.google.com/mapfiles/kml/shapes/shaded_dot.png</href></Icon></IconStyle>",
+    "edge": "<LineStyle><color>ff00a5ff</color><width>3</width></LineStyle>",
+    "location": "<LineStyle><color>ff2f2fd3</color><width>4</width></LineStyle>"
+    "<PolyStyle><color>402f2fd3</color></PolyStyle>",
+    "zone": "<LineStyle><color>ff2f2fd3</color><width>2</width></LineStyle>"
+    "<PolyStyle><color>802f2fd3</color></PolyStyle>",
+    "object": "<LineStyle><color>ffb0b0b0</color><width>2</width></LineStyle>"
+    "<PolyStyle><color>60b0b0b0</color></PolyStyle>",
+}
+"""Our styles, by what they are for; colours are aabbggrr."""
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """A KML file, the pictures that it refers to, and the name its one source had inside an archive, if any."""
+
+    kml: bytes
+    pictures: dict[str, bytes]
+    entry: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Document:
+    """A drawing with its items, as text. level and name: where it came from. root: the start tag's declarations."""
+
+    level: str
+    name: str
+    entry: str | None
+    xml: str
+
+
+def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, taken: frozenset[str]) -> Written:
+    """All vector layers and the places of grids. with_pictures: grids' pictures are made too; taken: names in use."""
+    frame = layers.frame
+    documents: list[_Document] = []
+    folders: list[str] = []
+    drawn = {i for part in layers.vector("objects").values() for i in part.ids}
+    for key in sorted(layers.parts):
+        part = layers.parts[key]
+        if not isinstance(part, Features):
+            continue
+        rest: Features | None = part
+        if key.layer == "objects" and key.name == FAMILY:
+            kept, rest = _drawings(key, part, frame)
+            documents += kept
+        elif key.layer == "topology":
+            rest = _undrawn(part, drawn)
+        if rest is not None:
+            folders.append(_folder(key, rest, layers, frame))
+    overlays, pictures = _grids(layers, context, with_pictures, taken)
+    ours = "".join([_datum(layers), *folders, *overlays])
+    for layer in ("voxels", "imagery"):
+        context.drop(layer, len(layers.of(layer)), "KML has no place for it")
+    entry = documents[0].entry if len(documents) == 1 else None
+    return Written((HEAD + _file(documents, ours, context)).encode(), pictures, entry)
+
+
+def _file(documents: list[_Document], ours: str, context: WriteContext) -> str:
+    """Drawings and our own folders as one document, in the simplest way that keeps all of it."""
+    if len(documents) == 1:
+        only = documents[0].xml
+        if not ours and not context.attribution:
+            return only.replace(END, "") + "\n"
+        if END in only and not re.match(r"<[\w.-]+:", only):
+            return only.replace(END, _map(ours, context, [])) + "\n"
+    inner = _distinct([d.xml.replace(END, "") for d in documents])
+    wrapped = [_wrapped(d, xml) for d, xml in zip(documents, inner, strict=True)]
+    return f"<kml {_NAMESPACES}>{_map(ours, context, wrapped)}</kml>\n"
+
+
+def _map(ours: str, context: WriteContext, documents: list[str]) -> str:
+    """Our own Document: its styles, what we tell in our words, and the documents of others."""
+    credit = escape("\n".join(context.attribution))
+    styles = "".join(f'<Style id="{STYLE}{n}">{s}</Style>' for n, s in _COLOURS.items() if f"#{STYLE}{n}<" in ours)
+    return "".join(
+        [
+            f"<Document><name>{escape(context.title)}</name>",
+            f"<description>{credit}</description>" if credit else "",
+            styles,
+            f"<ExtendedData>{_data(MARK, 'map')}</ExtendedData>\n",
+            *documents,
+            ours,
+            "</Document>",
+        ]
+    )
+
+
+def _data(name: str, value: Any) -> str:
+    return f'<Data name="{quoted(name)}"><value>{spell(value)}</value></Data>'
+
+
+# --- coordinates ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Texts:
+    """The coordinate lists of n geometries as text: those of geometry k are texts[start[k]:start[k + 1]], in the order
+    of its parts and rings; shape[k] is the geometry in the letters of ``_kml``.
+    """
+
+    texts: list[str]
+    start: list[int]
+    shape: list[str]
+
+    def of(self, k: int) -> list[str]:
+        return self.texts[self.start[k] : self.start[k + 1]]
+
+
+_LETTERS = {0: "P", 1: "L", 2: "L"}
+
+
+def _coordinate_texts(geometry: NDArray[np.object_], decimals: int, form: Callable[..., str], glue: str) -> _Texts:
+    """All coordinates as text at once. form: joins the numbers of one position; glue: stands between positions."""
+    parts, owner = shapely.get_parts(geometry, return_index=True)
+    while len(parts) and (shapely.get_type_id(parts) > 3).any():
+        parts, inner = shapely.get_parts(parts, return_index=True)
+        owner = owner[inner]
+    types = shapely.get_type_id(parts)
+    area = types == 3
+    count = np.where(area, 1 + np.maximum(shapely.get_num_interior_rings(parts), 0), 1)
+    part_of = np.repeat(np.arange(len(parts)), count)
+    lists = np.empty(len(part_of), object)
+    from_area = area[part_of]
+    lists[~from_area] = parts[~area]
+    lists[from_area] = shapely.get_rings(parts[area])
+    points, list_of = shapely.get_coordinates(lists, include_z=True, return_index=True)
+    columns = [_text.numbers(points[:, 0], decimals), _text.numbers(points[:, 1], decimals)]
+    deep = shapely.has_z(lists)
+    if deep.any():
+        heights = _text.numbers(np.where(np.isnan(points[:, 2]), 0.0, points[:, 2]), _text.METRES)
+        flat = (~deep[list_of]).tolist()
+        triples = zip(*columns, heights, flat, strict=True)
+        positions = [form(x, y) if plain else form(x, y, z) for x, y, z, plain in triples]
+    else:
+        positions = list(map(form, *columns))
+    bounds = np.searchsorted(list_of, np.arange(len(lists) + 1)).tolist()
+    texts = [glue.join(positions[a:b]) for a, b in pairwise(bounds)]
+    places = np.searchsorted(owner[part_of], np.arange(len(geometry) + 1)).tolist()
+    words = [_LETTERS.get(t, f"A{n}") for t, n in zip(types.tolist(), count.tolist(), strict=True)]
+    own = np.searchsorted(owner, np.arange(len(geometry) + 1)).tolist()
+    several = (shapely.get_type_id(geometry) > 3).tolist()
+    shape = [
+        ("M" if many else "") + (words[a] if b - a == 1 else "".join(words[a:b]))
+        for a, b, many in zip(own, own[1:], several, strict=False)
+    ]
+    return _Texts(texts, places, shape)
+
+
+def _comma(*numbers: str) -> str:
+    return ",".join(numbers)
+
+
+def _bracket(*numbers: str) -> str:
+    return f"[{','.join(numbers)}]"
+
+
+def _degrees(geometry: NDArray[np.object_]) -> _Texts:
+    return _coordinate_texts(geometry, _text.DEGREES, _comma, " ")
+
+
+def _element(geometry: Any, lists: Iterator[str], extra: str = "") -> str:
+    """A geometry as KML; its coordinate lists come from ``lists``."""
+    kind = geometry.geom_type
+    if geometry.is_empty:
+        return ""
+    if kind == "Point":
+        return f"<Point>{extra}<coordinates>{next(lists)}</coordinates></Point>"
+    hug = extra or "<tessellate>1</tessellate>"
+    if kind in ("LineString", "LinearRing"):
+        return f"<LineString>{hug}<coordinates>{next(lists)}</coordinates></LineString>"
+    if kind == "Polygon":
+        rings = [
+            f"<{side}BoundaryIs><LinearRing><coordinates>{next(lists)}</coordinates></LinearRing></{side}BoundaryIs>"
+            for side in ["outer"] + ["inner"] * len(geometry.interiors)
+        ]
+        return f"<Polygon>{hug}{''.join(rings)}</Polygon>"
+    inner = "".join(_element(g, lists, extra) for g in geometry.geoms)
+    return f"<MultiGeometry>{inner}</MultiGeometry>"
+
+
+# --- our own words ----------------------------------------------------------------------------------------------------
+
+
+def _undrawn(part: Features, drawn: set[str]) -> Features | None:
+    """A network without what was made from a drawing that is written too; None where nothing else is in it."""
+    made = [p.get("drawn_from") in drawn if "drawn_from" in p else False for p in part.properties]
+    if not any(made):
+        return part
+    return part.take(~np.array(made)) if not all(made) else None
+
+
+def _place_words(key: PartKey) -> str:
+    """Where an item belongs, as far as it is not what a reader takes for granted."""
+    words = _data("layer", key.layer)
+    if key.level != GROUND:
+        words += _data("level", key.level)
+    if key.name != (USUAL_PART[key.layer] or FAMILY):
+        words += _data("part", key.name)
+    return words
+
+
+def _datum(layers: Layers) -> str:
+    """The environment's datum as a placemark; the numbers that count stand in its ExtendedData."""
+    datum = layers.datum
+    if datum is None:
+        return ""
+    words = "".join(_data(n, v) for n, v in {"kind": "datum", **datum.as_dict()}.items())
+    at = ",".join(_text.numbers([datum.longitude, datum.latitude], _text.DEGREES))
+    return (
+        f"<Placemark><name>datum</name><ExtendedData>{_data('layer', 'location')}{words}</ExtendedData>"
+        f"<Point><coordinates>{at}</coordinates></Point></Placemark>\n"
+    )
+
+
+def _folder(key: PartKey, part: Features, layers: Layers, frame: LocalFrame | None) -> str:
+    """A part in our own words."""
+    words = [_data(MARK, "part"), _place_words(key)]
+    elevation = layers.elevation(key.level)
+    if elevation:
+        words.append(_data("elevation", elevation))
+    document = part.document if key.name != FAMILY else {}
+    if document:
+        words.append(_data("document", dict(document)))
+    title = key.layer if key.level == GROUND else f"{key.layer}, {key.level}"
+    return "".join(
+        [
+            f"<Folder><name>{escape(title)}</name><ExtendedData>{''.join(words)}</ExtendedData>\n",
+            *_placemarks(key, part, frame),
+            "</Folder>\n",
+        ]
+    )
+
+
+def _placemarks(key: PartKey, part: Features, frame: LocalFrame | None) -> Iterator[str]:
+    """Every item of a part as a placemark that says all we know of it."""
+    geometry = part.in_wgs84(frame)
+    texts = _degrees(geometry)
+    exact = _local_words(part)
+    place = _place_words(key)
+    opening: dict[str, str] = {}
+    types = shapely.get_type_id(geometry).tolist()
+    for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
+        out = ["<Placemark>"]
+        words = [place, f'<Data name="id"><value>{spell(i)}</value></Data>']
+        more: dict[str, Any] = {}
+        for label in sorted(p):
+            value = p[label]
+            if label == "name" and isinstance(value, str) and value == value.strip() != "":
+                shown = escape(value)
+                if "\ufffd" not in shown:
+                    out.append(f"<name>{shown}</name>")
+                    continue
+            start = opening.get(label)
+            if start is None:
+                good = label not in OWN_WORDS and label and label.isprintable() and label == label.strip()
+                start = opening[label] = f'<Data name="{quoted(label)}"><value>' if good else ""
+            if start:
+                words.append(f"{start}{spell(value)}</value></Data>")
+            else:
+                more[label] = value
+        if more:
+            words.append(_data("more", more))
+        if exact[k]:
+            words.append(f'<Data name="local"><value>{exact[k]}</value></Data>')
+        if types[k] == 7 and not geometry[k].is_empty:
+            words.append('<Data name="geometry"><value>GeometryCollection</value></Data>')
+        out.append(f"<styleUrl>#{STYLE}{_style(key.layer, p)}</styleUrl><ExtendedData>{''.join(words)}</ExtendedData>")
+        if types[k] == 0 and texts.start[k] < texts.start[k + 1] and not geometry[k].is_empty:
+            out.append(f"<Point><coordinates>{texts.texts[texts.start[k]]}</coordinates></Point>")
+        else:
+            out.append(_element(geometry[k], iter(texts.of(k))))
+        out.append("</Placemark>\n")
+        yield "".join(out)
+
+
+def _style(layer: Layer, properties: Properties) -> str:
+    if layer == "topology":
+        return "edge" if properties.get("kind") == "edge" else "node"
+    return {"location": "location", "zones": "zone"}.get(layer, "object")
+
+
+def _local_words(part: Features) -> list[str]:
+    """The exact metres of local items as JSON, an empty text for the others."""
+    out = [""] * len(part)
+    where = np.flatnonzero(part.local)
+    if not len(where):
+        return out
+    geometry = part.geometry[where]
+    texts = _coordinate_texts(geometry, _text.METRES, _bracket, ",")
+    for n, k in enumerate(where.tolist()):
+        shape, lists = texts.shape[n], texts.of(n)
+        if shape == "P":
+            out[k] = lists[0]
+        elif shape == "L":
+            out[k] = f"[{lists[0]}]"
+        elif shape[:1] == "A":
+            out[k] = f"[[{'],['.join(lists)}]]"
+        else:
+            out[k] = orjson.dumps(orjson.loads(shapely.to_geojson(geometry[n]))).decode()
+        if "[]" in out[k] and not geometry[n].is_empty:
+            out[k] = orjson.dumps(orjson.loads(shapely.to_geojson(geometry[n]))).decode()
+    return out
+
+
+def _grids(
+    layers: Layers, context: WriteContext, with_pictures: bool, taken: frozenset[str]
+) -> tuple[list[str], dict[str, bytes]]:
+    """Each grid as a GroundOverlay at its place, with all that its picture does not say, and the pictures."""
+    out: list[str] = []
+    pictures: dict[str, bytes] = {}
+    for key, grid in layers.grids().items():
+        label = key.name if key.level == GROUND else f"{key.level}-{key.name}"
+        stem = re.sub(r"[^\w.-]+", "_", label).strip(".") or "grid"
+        name, n = f"{stem}.png", 2
+        while name in taken or name in pictures:
+            name, n = f"{stem}-{n}.png", n + 1
+        pictures[name] = _image.overlay_png(grid) if with_pictures else b""
+        out.append(_overlay(key, grid, name, layers))
+    if out and not with_pictures:
+        context.drop("occupancy", len(out), "the pictures of grids travel in KMZ only; KML tells where they lie")
+    return out, pictures if with_pictures else {}
+
+
+def _overlay(key: PartKey, grid: OccupancyGrid, href: str, layers: Layers) -> str:
+    """Where a grid lies: a box and its rotation (exact to the box's own flatness), and the exact corners."""
+    frame = layers.frame
+    corners = grid.corners()
+    shape = np.array([shapely.polygons(corners)], object)
+    part = Features((key.name,), shape, ({},), np.ones(1, bool))
+    ring = shapely.get_coordinates(part.in_wgs84(frame))[:4]
+    turn, north, south, east, west = 0.0, *_box(ring)
+    if frame is not None:
+        heading = math.radians(frame.datum.heading)
+        middle = corners.mean(axis=0)
+        u, v = np.array([math.cos(heading), math.sin(heading)]), np.array([-math.sin(heading), math.cos(heading)])
+        w, h = grid.width * grid.resolution / 2, grid.height * grid.resolution / 2
+        sides = frame.to_wgs84(np.array([middle + w * u, middle - w * u, middle + h * v, middle - h * v]))
+        east, west, north, south = sides[0, 0], sides[1, 0], sides[2, 1], sides[3, 1]
+        turn = (math.degrees(grid.origin[2]) - frame.datum.heading + 180.0) % 360.0 - 180.0
+    words = {
+        "resolution": grid.resolution,
+        "origin": list(grid.origin),
+        "mode": grid.mode,
+        "occupied_thresh": grid.occupied_thresh,
+        "free_thresh": grid.free_thresh,
+        "negate": grid.negate,
+        "size": [grid.width, grid.height],
+    }
+    if grid.properties:
+        words["properties"] = dict(grid.properties)
+    told = _place_words(key) + "".join(_data(n, v) for n, v in words.items())
+    box = zip(("north", "south", "east", "west", "rotation"), (north, south, east, west, turn), strict=True)
+    sides_text = "".join(f"<{n}>{_text.number(v, _text.DEGREES)}</{n}>" for n, v in box if n != "rotation" or v)
+    quad = _degrees(shapely.linestrings(ring[None])).texts[0]
+    return (
+        f"<GroundOverlay><name>{escape(key.name)}</name><ExtendedData>{told}</ExtendedData>"
+        f"<Icon><href>{escape(href)}</href></Icon><LatLonBox>{sides_text}</LatLonBox>"
+        f'<gx:LatLonQuad xmlns:gx="{GX}"><coordinates>{quad}</coordinates></gx:LatLonQuad></GroundOverlay>\n'
+    )
+
+
+def _box(ring: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    west, south = ring.min(axis=0)
+    east, north = ring.max(axis=0)
+    return north, south, east, west
+
+
+# --- drawings ---------------------------------------------------------------------------------------------------------
+
+_ITEMS = re.compile(r"<\?items ([0-9]+)\?>")
+_PREFIX = re.compile(r"[<\s]/?([\w.-]+):[\w.-]+(?=[\s=>/])")
+_DECLARED = re.compile(r"xmlns:([\w.-]+)=")
+_ROOT = re.compile(r"<((?:[\w.-]+:)?([\w.-]+))((?:\s[^>]*?)?)(/?)>")
+_XMLNS = re.compile(r"""\sxmlns(?::[\w.-]+)?="[^"]*\"""")
+
+
+def _drawings(key: PartKey, part: Features, frame: LocalFrame | None) -> tuple[list[_Document], Features | None]:
+    """The uploaded drawings with their items in place, and the objects that belong to none of them."""
+    said = part.document.get(FAMILY)
+    known = said.get("documents") if isinstance(said, Mapping) else None
+    known = known if isinstance(known, Mapping) else {}
+    geometry = part.in_wgs84(frame)
+    texts = _degrees(geometry)
+    placed: dict[str, list[tuple[int, int, str]]] = {name: [] for name in known}
+    loose = []
+    roots = {name: _declarations(document["xml"]) for name, document in known.items()}
+    for k, p in enumerate(part.properties):
+        kept = p.get(FAMILY)
+        if not isinstance(kept, Mapping) or kept.get("document") not in known or not isinstance(kept.get("xml"), str):
+            loose.append(k)
+            continue
+        name = kept["document"]
+        xml = _filled(kept, p, geometry[k], texts, k, roots[name])
+        placed[name].append((int(kept.get("place", 0)), k, xml))
+    documents = [
+        _Document(key.level, name, document.get("entry"), _in_place(document["xml"], sorted(placed[name])))
+        for name, document in sorted(known.items())
+    ]
+    return documents, part.take(loose) if loose else None
+
+
+def _in_place(skeleton: str, items: Sequence[tuple[int, int, str]]) -> str:
+    """A document with its items where they stood."""
+    pieces = _ITEMS.split(skeleton)
+    starts = [int(n) for n in pieces[1::2]]
+    groups: list[list[str]] = [[] for _ in starts]
+    over: list[str] = []
+    for place, _, xml in items:
+        at = bisect.bisect_right(starts, place) - 1
+        (groups[at] if at >= 0 else over).append(xml)
+    out = [pieces[0]]
+    for group, after in zip(groups, pieces[2::2], strict=True):
+        out += ["\n", "\n".join(group), "\n", after]
+    text = "".join(out)
+    return text.replace(END, "\n".join(over) + END) if over else text
+
+
+def _declarations(xml: str) -> str:
+    """The namespace declarations of a document's root."""
+    root = _ROOT.match(xml)
+    return "".join(_XMLNS.findall(root[3])) if root else ""
+
+
+def _filled(kept: Mapping[str, Any], p: Properties, geometry: Any, texts: _Texts, k: int, declarations: str) -> str:
+    """A kept element with the name, the values and the place that the object has now."""
+    xml: str = kept["xml"]
+    shape = kept.get("shape")
+    if shape is None:
+        xml = _same_or_redrawn(xml, geometry, declarations, texts.of(k))
+    elif shape != texts.shape[k]:
+        xml = _redrawn(xml, geometry, declarations, texts.of(k))
+    else:
+        begin, end = texts.start[k], texts.start[k + 1]
+        if end - begin == 1:
+            xml = xml.replace(COORDINATES, texts.texts[begin], 1)
+        else:
+            lists = iter(texts.texts[begin:end])
+            xml = "".join(next(lists) if s == COORDINATES else s for s in re.split(r"(<\?c\?>)", xml))
+    name = p.get("name")
+    if NAME in xml:
+        xml = xml.replace(NAME, "" if name is None else escape(str(name)), 1)
+    elif name is not None and "<name>" not in xml:
+        xml = _ROOT.sub(lambda m: _with_name(m, escape(str(name))), xml, count=1)
+    if "<?d " in xml:
+        aside = kept.get("data")
+        aside = aside if isinstance(aside, Mapping) else {}
+        xml = SLOT.sub(lambda m: _value(unquote(m[2]), p, aside) if m[2] is not None else "", xml)
+    return xml
+
+
+def _with_name(start: re.Match[str], name: str) -> str:
+    """A start tag, and the name as its first child."""
+    whole, _, attributes, empty = start.groups()
+    prefix = whole.rpartition(":")[0]
+    tag = f"{prefix}:name" if prefix else "name"
+    close = f"</{whole}>" if empty else ""
+    return f"<{whole}{attributes}><{tag}>{name}</{tag}>{close}"
+
+
+def _value(label: str, p: Properties, aside: Mapping[str, Any]) -> str:
+    value = aside[label] if label in aside else p.get(label, "")
+    return escape(value if isinstance(value, str) else orjson.dumps(value, option=orjson.OPT_SORT_KEYS).decode())
+
+
+def _parsed(xml: str, declarations: str) -> etree._Element:
+    """A kept element as a tree, inside a wrapper with its document's namespaces; slots stay as instructions."""
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
+    wrapper = etree.fromstring(f"<w{declarations}>{xml}</w>".encode(), parser)
+    return wrapper[0]
+
+
+def _unparsed(element: etree._Element) -> str:
+    text: str = etree.tostring(element.getparent(), encoding="unicode")
+    return text[text.index(">") + 1 : text.rindex("<")]
+
+
+def _same_or_redrawn(xml: str, geometry: Any, declarations: str, lists: list[str]) -> str:
+    """An element that holds its own geometry: as it is, unless the object lies elsewhere by now."""
+    element = _parsed(xml, declarations)
+    before = item_geometry(element)
+    both_empty = before.is_empty and geometry.is_empty
+    if both_empty or shapely.equals_exact(before, geometry, tolerance=_SAME_PLACE):
+        return xml
+    return _redrawn(xml, geometry, declarations, lists)
+
+
+def _redrawn(xml: str, geometry: Any, declarations: str, lists: list[str]) -> str:
+    """The element with another geometry. An overlay gets new corners, a model a new place."""
+    element = _parsed(xml, declarations)
+    kind = local_name(element)
+    if kind == "GroundOverlay":
+        return _moved_overlay(element, geometry, lists)
+    old = [c for c in element if isinstance(c.tag, str) and local_name(c) in GEOMETRIES]
+    spot = child(old[0], "Location") if len(old) == 1 and local_name(old[0]) == "Model" else None
+    if spot is not None and geometry.geom_type == "Point" and not geometry.is_empty:
+        numbers = lists[0].split(",")
+        for word, text in zip(("longitude", "latitude", "altitude"), [*numbers, "0.0"][:3], strict=True):
+            found = child(spot, word)
+            if found is not None:
+                found.text = text
+        return _unparsed(element)
+    at = element.index(old[0]) if old else len(element)
+    modes = old[0] if old and local_name(old[0]) in ("Point", "LineString", "LinearRing", "Polygon") else ()
+    keep = [c for c in modes if isinstance(c.tag, str) and local_name(c) in ("extrude", "tessellate", "altitudeMode")]
+    namespace = etree.QName(element).namespace
+    extra = "".join(f"<{local_name(c)}>{escape(c.text or '')}</{local_name(c)}>" for c in keep)
+    for c in old:
+        element.remove(c)
+    made = _element(geometry, iter(lists), extra)
+    if made:
+        declared = f' xmlns="{namespace}"' if namespace else ""
+        element.insert(at, etree.fromstring(f"<w{declared}>{made}</w>")[0])
+    return _unparsed(element)
+
+
+def _moved_overlay(element: etree._Element, geometry: Any, lists: list[str]) -> str:
+    for word in ("LatLonBox", "LatLonQuad"):
+        found = child(element, word)
+        if found is not None:
+            element.remove(found)
+    corners = [] if geometry.is_empty or geometry.geom_type != "Polygon" else lists[0].split(" ")[:-1]
+    if len(corners) == 4:
+        quad = f'<gx:LatLonQuad xmlns:gx="{GX}"><coordinates>{" ".join(corners)}</coordinates></gx:LatLonQuad>'
+        element.append(etree.fromstring(quad))
+    elif not geometry.is_empty:
+        box = zip(("west", "south", "east", "north"), _text.numbers(geometry.bounds, _text.DEGREES), strict=True)
+        namespace = etree.QName(element).namespace
+        declared = f' xmlns="{namespace}"' if namespace else ""
+        sides = "".join(f"<{n}>{v}</{n}>" for n, v in box)
+        element.append(etree.fromstring(f"<LatLonBox{declared}>{sides}</LatLonBox>"))
+    return _unparsed(element)
+
+
+_STYLE_ID = re.compile(r'(<(?:[\w.-]+:)?(?:Style|StyleMap|CascadingStyle)\s(?:[^>]*?\s)?(?:[\w.-]+:)?id=")([^"]*)(")')
+_STYLE_URL = re.compile(r"(<(?:[\w.-]+:)?styleUrl(?:\s[^>]*)?>\s*#)([^<\s]*)")
+
+
+def _distinct(documents: list[str]) -> list[str]:
+    """The documents with style ids that no other one has, so that each placemark keeps its own style."""
+    used: set[str] = set()
+    out = []
+    for xml in documents:
+        mine = {m[2] for m in _STYLE_ID.finditer(xml)}
+        names: dict[str, str] = {}
+        for i in sorted(mine & used):
+            n = 2
+            while f"{i}-{n}" in used or f"{i}-{n}" in mine or f"{i}-{n}" in names.values():
+                n += 1
+            names[i] = f"{i}-{n}"
+        used |= {names.get(i, i) for i in mine}
+        out.append(_renamed(xml, names) if names else xml)
+    return out
+
+
+def _renamed(xml: str, names: Mapping[str, str]) -> str:
+    xml = _STYLE_ID.sub(lambda m: f"{m[1]}{names.get(m[2], m[2])}{m[3]}", xml)
+    return _STYLE_URL.sub(lambda m: f"{m[1]}{names.get(m[2], m[2])}", xml)
+
+
+def _wrapped(document: _Document, xml: str) -> str:
+    """A whole document inside ours: its root becomes a Document that says where it came from."""
+    words = _data(MARK, "document") + _data("document", document.name)
+    if document.entry is not None:
+        words += _data("entry", document.entry)
+    if document.level != GROUND:
+        words += _data("level", document.level)
+    declarations = _declarations(xml)
+    root = _ROOT.match(xml)
+    if root and root[2] == "kml":
+        xml = "" if root[4] else xml[root.end() : xml.rindex("<")]
+    default = "" if ' xmlns="' in declarations else f' xmlns="{KML}"'
+    shown = escape(document.name.rpartition("/")[2])
+    return (
+        f'<Document{default}{declarations}><name>{shown}</name><ExtendedData xmlns="{KML}">{words}</ExtendedData>'
+        f"{xml}</Document>\n"
+    )

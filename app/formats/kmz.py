@@ -1,0 +1,97 @@
+"""KMZ: a KML file with its images in a ZIP archive.
+
+The main document is the first entry whose name ends in ``.kml``, in the archive's own order, as the reference reader
+takes it; every other entry is kept byte for byte. Grids travel here with their pictures and come back as grids.
+"""
+
+from __future__ import annotations
+
+from app.errors import Problem, UnreadableFile
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, register
+from app.formats import _archive as archive
+from app.formats._kml import FAMILY, read_kml
+from app.formats._kml_writing import write_kml
+from app.model.layers import Layers, Part, PartKey, Resources
+
+MAIN = "map.kmz"
+DOCUMENT = "doc.kml"
+RESOURCES = "kmz"
+
+
+def detect(name: str, data: bytes) -> bool:
+    """A file called .kmz, or an archive under another name that begins with a KML file (a .zip is a folder)."""
+    lower = name.lower()
+    if lower.endswith(".kmz"):
+        return True
+    return archive.is_archive(data) and not lower.endswith(".zip") and _first_name(data).endswith(b".kml")
+
+
+def _first_name(data: bytes) -> bytes:
+    return data[30 : 30 + int.from_bytes(data[26:28], "little")].lower()
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """The layers of the main document, and all other entries as resources."""
+    entries = archive.unpack(files[context.main], context.limits)
+    main = first_kml(entries)
+    others = {name: body for name, body in entries.items() if name != main}
+    layers, used = read_kml(entries[main], context, context.main, others, main)
+    kept = {name: body for name, body in others.items() if name not in used}
+    parts: dict[PartKey, Part] = dict(layers.parts)
+    if kept and context.wants("resources"):
+        parts[PartKey("resources", context.level, RESOURCES)] = Resources(kept)
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def first_kml(entries: Files) -> str:
+    """The name of the main document. Raises UnreadableFile where there is none."""
+    main = next((name for name in entries if name.lower().endswith(".kml")), None)
+    if main is None:
+        names = ", ".join(sorted(entries)[:5]) or "nothing"
+        reason = f"the archive has no .kml entry (it holds {names}): a KMZ needs one, usually doc.kml"
+        raise UnreadableFile(reason, [Problem(reason)])
+    return main
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """One archive: the main document first, then pictures and the entries that were uploaded, by name."""
+    others: dict[str, bytes] = {}
+    for part in layers.of("resources", name=RESOURCES).values():
+        if isinstance(part, Resources):
+            for name, body in part.files.items():
+                if others.setdefault(name, body) != body:
+                    context.drop("resources", 1, f"two levels bring another file called {name}")
+    made = write_kml(layers, context, with_pictures=True, taken=frozenset(others))
+    main = made.entry if made.entry and not archive.bad_name(made.entry) else DOCUMENT
+    stem, n = main.removesuffix(".kml"), 2
+    while main in others or main in made.pictures:
+        main, n = f"{stem}-{n}.kml", n + 1
+    return {MAIN: archive.pack({**others, **made.pictures, main: made.kml}, main)}
+
+
+register(
+    Format(
+        name="kmz",
+        title="KMZ (KML with its images)",
+        files=(MAIN,),
+        media_types=("application/vnd.google-earth.kmz",),
+        carries=frozenset({"location", "objects", "topology", "zones", "occupancy", "resources"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(
+            (
+                frozenset({"objects"}),
+                frozenset({"topology"}),
+                frozenset({"location"}),
+                frozenset({"zones"}),
+                frozenset({"occupancy"}),
+            ),
+            anchor="wgs84",
+        ),
+        family=FAMILY,
+        drawing=True,
+        rank=11,
+        extensions=(".kmz",),
+    )
+)
