@@ -364,17 +364,21 @@ def _compete(found: list[Read], bundle: Bundle) -> None:
     for one in found:
         by_key.setdefault(one.key, []).append(one)
     useful: set[str] = set()
-    for key, rivals in sorted(by_key.items()):
+    renamed: dict[str, dict[str, str]] = {}
+    for key, rivals in sorted(by_key.items()):  # objects come before the topology that was drawn from them
         winners = rivals
-        if key.layer in ("topology", "location", "occupancy", "voxels", "imagery") and len(rivals) > 1:
+        if key.layer in _ONE_TELLER and len(rivals) > 1:
             rivals.sort(key=_trust)
             winners = rivals[:1]
             for loser in rivals[1:]:
-                what = {"topology": "network", "location": "location", "occupancy": f"grid {key.name}"}.get(key.layer)
-                reason = f"its {what or key.layer} is not used: {winners[0].group.main} tells it"
+                if key.layer == "location" and _take_drawing(winners, loser):
+                    useful.add(loser.group.main)
+                    continue
+                what = _ONE_TELLER[key.layer].format(name=key.name)
+                reason = f"its {what} is not used: {winners[0].group.main} tells it"
                 bundle.warnings.append(Problem(reason, loser.group.main))
         useful.update(w.group.main for w in winners)
-        bundle.parts[key] = _join(key, [w.part for w in winners])
+        bundle.parts[key] = _join(winners, renamed)
         names = tuple(sorted({n for w in winners for n in w.group.files}))
         bundle.origin[key] = (names, winners[0].group.format.name)
     for one in found:
@@ -383,29 +387,64 @@ def _compete(found: list[Read], bundle: Bundle) -> None:
                 bundle.files[name].used = False
 
 
+_ONE_TELLER: Mapping[str, str] = {
+    "topology": "network",
+    "location": "location",
+    "occupancy": "grid {name}",
+    "voxels": "voxel map {name}",
+    "imagery": "picture {name}",
+}
+"""Layers of which one file's word is enough, as a user calls them."""
+
+
+def _take_drawing(winners: list[Read], loser: Read) -> bool:
+    """A drawn fence in the same place as the believed one: its name and style go along, and nothing is lost."""
+    site, drawn = winners[0].part, loser.part
+    if not (isinstance(site, Features) and isinstance(drawn, Features) and len(site) == len(drawn) == 1):
+        return False
+    if site.local.any() or drawn.local.any():
+        return False
+    if shapely.hausdorff_distance(site.geometry[0], drawn.geometry[0]) >= SAME_PLACE_DEGREES:
+        return False
+    properties = ({**drawn.properties[0], **site.properties[0]},)
+    part = Features(site.ids, site.geometry, properties, site.local, {**drawn.document, **site.document})
+    winners[0] = Read(winners[0].key, part, winners[0].group)
+    return True
+
+
 def _trust(one: Read) -> tuple[object, ...]:
     name = PurePosixPath(one.group.main).name
     return (-one.group.format.rank, name.startswith("."), "_autogen" in name, len(name), one.group.main)
 
 
-def _join(key: PartKey, parts: list[Part]) -> Part:
-    if len(parts) == 1:
-        return parts[0]
-    if key.layer == "resources":
+def _join(told: list[Read], renamed: dict[str, dict[str, str]]) -> Part:
+    """Several files' parts of one key as one; ids that repeat are made distinct, and ``renamed`` remembers how."""
+    if len(told) == 1:
+        part = told[0].part
+        new = renamed.get(told[0].group.main, {})
+        if told[0].key.layer == "topology" and isinstance(part, Features) and new:
+            properties = [
+                {**p, "drawn_from": new[p["drawn_from"]]} if p.get("drawn_from") in new else p for p in part.properties
+            ]
+            part = Features(part.ids, part.geometry, tuple(properties), part.local, part.document)
+        return part
+    if told[0].key.layer == "resources":
         files: dict[str, bytes] = {}
-        for part in parts:
-            files.update(part.files if isinstance(part, Resources) else {})
+        for one in told:
+            files.update(one.part.files if isinstance(one.part, Resources) else {})
         return Resources(files)
-    collections = [p for p in parts if isinstance(p, Features)]
     taken: set[str] = set()
-    renamed = []
-    for c in collections:
-        ids = unique_ids(c.ids, taken)
+    collections = []
+    for one in told:
+        part = one.part
+        assert isinstance(part, Features)
+        ids = tuple(unique_ids(part.ids, taken))
         taken.update(ids)
-        renamed.append(
-            c if tuple(ids) == c.ids else Features(tuple(ids), c.geometry, c.properties, c.local, c.document)
-        )
-    return concatenate(renamed)
+        if ids != part.ids:
+            renamed[one.group.main] = {a: b for a, b in zip(part.ids, ids, strict=True) if a != b}
+            part = Features(ids, part.geometry, part.properties, part.local, part.document)
+        collections.append(part)
+    return concatenate(collections)
 
 
 def _choose_datum(bundle: Bundle, known: Known) -> None:
