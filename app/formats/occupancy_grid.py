@@ -145,15 +145,16 @@ def _find_image(said: str, main: str, names: Iterable[str]) -> tuple[str | None,
     base = re.split(r"[/\\]", said)[-1]
     if not base or base in (".", ".."):
         return None, ""
-    found = [n for n in sorted(known, key=lambda n: (n != beside + base, n.count("/"), n)) if n.split("/")[-1] == base]
-    if not found:
-        return None, ""
-    if found[0] == beside + said:
-        return found[0], ""
-    warning = f"the image {said[:200]!r} is not part of the upload; {found[0]!r} was taken for it"
-    if len(found) > 1 and found[0] != beside + base:
-        warning += f" (also of this name: {', '.join(found[1:4])})"
-    return found[0], warning
+    if beside + base in known:
+        found = beside + base
+    else:
+        same = [n for n in known if n.rpartition("/")[2] == base]
+        if len(same) != 1:  # of several one would be a guess, and a robot would drive by it
+            return None, ""
+        found = same[0]
+    if found == beside + said:
+        return found, ""
+    return found, f"the image {said[:200]!r} is not part of the upload; {found!r} was taken for it"
 
 
 # --- reading ------------------------------------------------------------------------------------------------------
@@ -227,7 +228,7 @@ def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadConte
         raise UnreadableFile("; ".join(f"{p.file}: {p.problem}" for p in problems), problems)
     picture, warning = _find_image(str(image), main, files)
     if picture is None or picture == main:
-        reason = f"the image {str(image)[:200]!r} is not in the upload: add this file"
+        reason = f"the image {str(image)[:200]!r} is not in the upload: add this file, beside the YAML"
         raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, _line(data, "image"), "image")])
     if warning:
         context.warn(warning, file=main, line=_line(data, "image"), where="image")
