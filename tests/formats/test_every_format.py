@@ -1,0 +1,130 @@
+"""What holds for every format, by its registration and its samples alone: a new format is tested here by itself."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from app import formats
+from app.bundle import Hints, Known, read, unpack
+from app.errors import BadUpload, CannotConvert, Invalid, MissingLayer
+from app.formats import Limits
+from app.model.frame import Datum
+from app.model.layers import LAYERS, Layers
+
+SAMPLES = Path(__file__).resolve().parents[1] / "samples"
+HERE = Datum(53.2686, -0.5245, heading=12.5)
+LIMITS = Limits()
+
+
+def cases() -> list[tuple[str, str, dict[str, bytes]]]:
+    """(format, case, files): each folder below samples/<format>, and each lone file there, is a map."""
+    out = []
+    for folder in sorted(SAMPLES.iterdir()) if SAMPLES.is_dir() else []:
+        for item in sorted(folder.iterdir()):
+            if item.is_dir():
+                files = {p.relative_to(item).as_posix(): p.read_bytes() for p in sorted(item.rglob("*")) if p.is_file()}
+                files = {n: d for n, d in files.items() if not n.endswith("facts.json")}
+                out.append((folder.name, f"{folder.name}/{item.name}", files))
+            elif not item.name.endswith("facts.json"):
+                out.append((folder.name, f"{folder.name}/{item.name}", {item.name: item.read_bytes()}))
+    return out
+
+
+CASES = [pytest.param(f, files, id=case) for f, case, files in cases()]
+NAMES = sorted(formats.all_formats())
+
+
+def layers_of(name: str, files: dict[str, bytes], hints: Hints | None = None) -> Layers:
+    told = read(unpack(files, LIMITS), hints or Hints(name), Known(), LIMITS)
+    return told.layers(HERE)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_format_says_all_that_is_asked_of_it(name: str) -> None:
+    known = formats.get_format(name)
+    assert known.title
+    assert known.carries <= set(LAYERS)
+    assert len(known.media_types) == len(known.files) > 0
+    assert known.read is None or known.extensions, "a reader needs extensions, so that a named format finds its file"
+    assert known.write is None or known.needs.one_of, "a writer says what it needs"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_format_has_a_sample(name: str) -> None:
+    assert any(f == name for f, _, _ in cases()), f"add a sample of our own to tests/samples/{name}"
+
+
+@pytest.mark.parametrize(("name", "files"), CASES)
+def test_content_alone_tells_the_format(name: str, files: dict[str, bytes]) -> None:
+    groups, _ = formats.group(files)
+    assert name in {g.format.name for g in groups}
+
+
+@pytest.mark.parametrize(("name", "files"), CASES)
+def test_what_is_written_reads_as_the_same_and_writes_the_same_bytes(name: str, files: dict[str, bytes]) -> None:
+    known = formats.get_format(name)
+    first = _written(known, layers_of(name, files))
+    second = _written(known, layers_of(name, first))
+    assert first == second
+    assert _written(known, layers_of(name, files)) == first, "the same input gives the same bytes"
+
+
+def _written(known: formats.Format, layers: Layers) -> dict[str, bytes]:
+    carried = Layers({k: p for k, p in layers.parts.items() if k.layer in known.carries}, layers.datum, layers.levels)
+    return formats.write(known, carried, formats.WriteContext())
+
+
+def mutations(data: bytes, seed: int) -> list[bytes]:
+    """Truncated, flipped, doubled, with other types and huge numbers."""
+    dice = random.Random(seed)
+    out = [b"", data[:1], data[: len(data) // 2], data[:-1], data + data, data[::-1]]
+    out += [data[: dice.randrange(len(data))] for _ in range(8)]
+    for _ in range(16):
+        flipped = bytearray(data)
+        for _ in range(dice.choice([1, 1, 4])):
+            flipped[dice.randrange(len(flipped))] = dice.randrange(256)
+        out.append(bytes(flipped))
+    digits = [k for k, c in enumerate(data) if 48 <= c <= 57]
+    for text in (b"nan", b"inf", b"-1e999", b"9" * 5000, b"1" * 30, b"-1", b"0", b"true", b"null", b"[]", b"{}", b"''"):
+        if digits:
+            k = dice.choice(digits)
+            end = k
+            while end < len(data) and chr(data[end]) in "0123456789.":
+                end += 1
+            out.append(data[:k] + text + data[end:])
+    a, b = sorted(dice.sample(range(len(data) + 1), 2))
+    out.append(data[:a] + data[b:])
+    out.append(data[:b] + data[a:b] + data[b:])
+    return out
+
+
+@pytest.mark.parametrize(("name", "files"), CASES)
+def test_damaged_files_are_refused_with_file_and_reason_or_read(name: str, files: dict[str, bytes]) -> None:
+    refused = 0
+    for victim in sorted(files):
+        for k, damaged in enumerate(mutations(files[victim], seed=len(victim))):
+            try:
+                layers_of(name, {**files, victim: damaged})
+            except (BadUpload, Invalid) as error:
+                refused += 1
+                assert error.detail, f"mutation {k} of {victim} is refused without a reason"
+                assert all(p.problem for p in error.problems)
+                if isinstance(error, BadUpload):
+                    assert error.problems, f"mutation {k} of {victim} is refused without a place"
+                    assert all(p.file for p in error.problems), f"mutation {k} of {victim}: which file?"
+    assert refused, "no damage at all is noticed"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_format_is_not_made_from_nothing(name: str) -> None:
+    from app.convert.recipe import Stock, chain
+
+    known = formats.get_format(name)
+    if known.write is None:
+        pytest.fail(f"{name} is not served: say so in the contract's table first")
+    with pytest.raises((MissingLayer, CannotConvert)) as caught:
+        chain(known, Stock(frozenset(), False), known.write_options())
+    assert "supply" in caught.value.detail or "needs" in caught.value.detail
