@@ -1,0 +1,243 @@
+"""Which file is which map, what a folder says, which of two files is believed."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import shapely
+
+from app.bundle import Bundle, Hints, Known, corner, read, template_folder, unpack
+from app.errors import BadUpload, Invalid, UnreadableFile
+from app.formats import Limits
+from app.model.features import Features, features
+from app.model.layers import PartKey
+
+LIMITS = Limits()
+
+DATUM = b"datum_latitude: 53.26\ndatum_longitude: -0.52\n"
+FENCED = (
+    DATUM + b"gnss_fence:\n  gnss_fence_coords: [[53.26, -0.52], [53.261, -0.52], [53.261, -0.519], [53.26, -0.519]]\n"
+)
+GRID = (
+    b"image: map.pgm\nresolution: 0.1\norigin: [0.0, 0.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+)
+PGM = b"P5\n2 2\n255\n\x00\xfe\xfe\xcd"
+
+
+def placemark(name: str, shape: str, points: str) -> str:
+    inner = f"<coordinates>{points}</coordinates>"
+    if shape == "Polygon":
+        inner = f"<outerBoundaryIs><LinearRing>{inner}</LinearRing></outerBoundaryIs>"
+    return f"<Placemark><name>{name}</name><{shape}>{inner}</{shape}></Placemark>"
+
+
+def kml(*placemarks: str) -> bytes:
+    return f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{"".join(placemarks)}</Document></kml>'.encode()
+
+
+FENCE = placemark("the edge", "Polygon", "-0.52,53.26 -0.52,53.261 -0.519,53.261 -0.519,53.26 -0.52,53.26")
+FIELD = placemark("field", "Polygon", "-0.53,53.26 -0.53,53.262 -0.529,53.262 -0.53,53.26")
+PATH = placemark("path", "LineString", "-0.52,53.26 -0.5195,53.2605 -0.519,53.261")
+
+
+def tmap2(name: str) -> bytes:
+    node = (
+        "- meta: {map: m, node: %s, pointset: p}\n  node:\n    name: %s\n    parent_frame: map\n    verts: []\n"
+        "    pose: {position: {x: %s, y: 0.0, z: 0.0}, orientation: {w: 1.0, x: 0.0, y: 0.0, z: 0.0}}\n"
+        "    edges: [{edge_id: %s, node: %s, action: move_base}]\n"
+    )
+    nodes = node % ("A", "A", "0.0", "A_B", "B") + node % ("B", "B", "1.0", "B_A", "A")
+    return f"meta: {{last_updated: 2022-01-01_00-00-00}}\nmetric_map: m\nname: {name}\npointset: p\nnodes:\n{nodes}".encode()
+
+
+def told(files: dict[str, bytes], *, known: Known | None = None, **hints: Any) -> Bundle:
+    return read(unpack(files, LIMITS), Hints(**hints), known or Known(), LIMITS)
+
+
+def part(bundle: Bundle, layer: str, name: str) -> Features:
+    found = bundle.parts[PartKey(layer, "ground", name)]  # type: ignore[arg-type]
+    assert isinstance(found, Features)
+    return found
+
+
+def kinds(f: Features) -> list[Any]:
+    return sorted(str(p["kind"]) for p in f.properties)
+
+
+def warned(bundle: Bundle, file: str) -> str:
+    return " ".join(w.problem for w in bundle.warnings if w.file == file)
+
+
+def test_what_was_written_by_hand_wins_over_what_was_generated() -> None:
+    other = DATUM.replace(b"53.26", b"10.0")
+    bundle = told({"datum.yaml": DATUM, "datum_autogen.yaml": other})
+    assert bundle.datum is not None
+    assert bundle.datum.latitude == 53.26
+    assert not bundle.files["datum_autogen.yaml"].used
+    assert bundle.files["datum.yaml"].used
+    assert "datum.yaml is used" in warned(bundle, "datum_autogen.yaml")
+
+
+def test_a_real_network_wins_over_a_drawn_one_and_regions_stay() -> None:
+    bundle = told(
+        {
+            "config/location/datum.yaml": DATUM,
+            "config/topological/network.tmap2.yaml": tmap2("hand"),
+            "config/topological/.network.tmap2": tmap2("hidden"),
+            "config/topological/drawn.kml": kml(PATH),
+            "config/topological/drawn_regions.kml": kml(FIELD),
+        }
+    )
+    network = part(bundle, "topology", "network")
+    assert network.document["tmap2"]["name"] == "hand"
+    assert not bundle.files["config/topological/.network.tmap2"].used
+    assert not bundle.files["config/topological/drawn.kml"].used
+    assert kinds(part(bundle, "objects", "kml")) == ["region"]
+
+
+def test_a_drawing_in_topological_alone_is_a_network_and_stays_a_drawing() -> None:
+    bundle = told({"config/topological/drawn.kml": kml(PATH)})
+    network = part(bundle, "topology", "network")
+    assert kinds(network) == ["edge"] * 4 + ["node"] * 3
+    assert len(part(bundle, "objects", "kml")) == 1
+
+
+def test_the_layer_says_what_a_drawing_is_meant_for() -> None:
+    assert kinds(part(told({"a.kml": kml(FIELD, PATH)}), "objects", "kml")) == ["path", "region"]
+    bundle = told({"a.kml": kml(FIELD, PATH)}, layer="zones")
+    assert kinds(part(bundle, "zones", "zones")) == ["keepout"]
+    assert kinds(part(bundle, "objects", "kml")) == ["path"]
+    bundle = told({"a.kml": kml(FIELD)}, layer="location")
+    assert kinds(part(bundle, "location", "site")) == ["fence"]
+
+
+def test_the_environments_own_fence_is_found_among_the_fields() -> None:
+    bundle = told({"config/location/datum.yaml": FENCED, "config/location/fields.kml": kml(FIELD, FENCE)})
+    site = part(bundle, "location", "site")
+    assert len(site) == 1
+    assert site.properties[0]["name"] == "the edge"
+    assert kinds(part(bundle, "objects", "kml")) == ["region"]
+
+
+def test_polygons_without_a_fence_among_them_are_regions() -> None:
+    bundle = told({"a.kml": kml(FIELD, FIELD.replace("field", "other"))}, layer="location")
+    assert kinds(part(bundle, "objects", "kml")) == ["region", "region"]
+    assert "no GNSS fence" in warned(bundle, "a.kml")
+
+
+def test_grids_are_called_by_their_folder_in_a_template_and_by_their_file_elsewhere() -> None:
+    files = {f"config/metric/{f}/map.{e}": d for f in ("map", "nogo") for e, d in (("yaml", GRID), ("pgm", PGM))}
+    assert {k.name for k in told(files).parts} == {"map", "nogo"}
+    assert {k.name for k in told({"hall.yaml": GRID, "map.pgm": PGM}).parts} == {"hall"}
+    assert {k.name for k in told({"hall.yaml": GRID, "map.pgm": PGM}, grid="keepout").parts} == {"keepout"}
+
+
+def test_a_zip_of_a_folder_is_the_same_as_its_files() -> None:
+    files = {"config/location/datum.yaml": FENCED, "config/topological/n.kml": kml(PATH)}
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as z:
+        for name, data in files.items():
+            z.writestr(name, data)
+    packed = told({"farm.zip": buffer.getvalue()})
+    assert packed.parts.keys() == told(files).parts.keys()
+    assert packed.datum == told(files).datum
+
+
+def test_two_drawings_with_the_same_ids_are_both_kept() -> None:
+    bundle = told({"a.kml": kml(PATH), "b.kml": kml(PATH, FIELD)})
+    assert len(part(bundle, "objects", "kml")) == 3
+
+
+def test_without_a_datum_the_south_west_corner_is_taken_with_a_warning() -> None:
+    bundle = told({"a.kml": kml(PATH)})
+    assert bundle.datum is not None
+    assert (bundle.datum.latitude, bundle.datum.longitude) == (53.26, -0.52)
+    assert any("south-west corner" in w.problem for w in bundle.warnings)
+
+
+def test_the_corner_across_the_antimeridian_is_the_western_end() -> None:
+    line = shapely.LineString([(179.9, -17.0), (180.0, -16.9)])
+    other = shapely.LineString([(-180.0, -16.9), (-179.8, -16.8)])
+    found = corner({PartKey("objects"): features([("a", line, {}), ("b", other, {})], "wgs84")})
+    assert found is not None
+    assert (found.latitude, found.longitude) == (-17.0, 179.9)
+
+
+def test_variables_are_read_and_never_run() -> None:
+    bundle = told({"config/properties.sh": b"export FARM_NAME='x'\nexport BAD=$(rm -rf /)\n", "datum.yaml": DATUM})
+    empty = part(bundle, "objects", "environment")
+    assert empty.document["environment"]["variables"] == {"FARM_NAME": "x"}
+    assert warned(bundle, "config/properties.sh")
+
+
+def test_unknown_files_stay_sources_with_a_warning() -> None:
+    bundle = told({"datum.yaml": DATUM, "model.stl": b"solid", "LICENSE": b"x", "a/.placeholder": b""})
+    assert [w.file for w in bundle.warnings if "no format" in w.problem] == ["model.stl"]
+    assert not bundle.files["model.stl"].used
+
+
+@pytest.mark.parametrize(
+    ("files", "hints", "error", "words"),
+    [
+        ({}, {}, Invalid, "no file"),
+        ({"a.bin": b"\x00\x01"}, {}, UnreadableFile, "none of the files is a map"),
+        ({"a.kml": b""}, {}, UnreadableFile, "empty"),
+        ({"a.kml": kml(PATH)}, {"layer": "occupancy"}, Invalid, "layer must be one of"),
+        ({"a.kml": kml(PATH)}, {"options": {"colour": "red"}}, Invalid, "colour"),
+        ({"a.kml": b"<kml><Document>"}, {}, BadUpload, "a.kml"),
+    ],
+)
+def test_what_cannot_be_taken_is_refused_with_a_reason(
+    files: dict[str, bytes], hints: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        told(files, **hints)
+
+
+def test_every_bad_file_of_an_upload_is_named() -> None:
+    with pytest.raises(BadUpload) as caught:
+        told({"a.kml": b"<kml><Document>", "datum.yaml": DATUM.replace(b"53.26", b"953.26")})
+    assert {p.file for p in caught.value.problems} == {"a.kml", "datum.yaml"}
+
+
+@pytest.mark.parametrize(
+    ("name", "below"),
+    [
+        ("config/metric/map/map.yaml", ("metric", "map", "map.yaml")),
+        ("farm/config/location/datum.yaml", ("location", "datum.yaml")),
+        ("topological/network.tmap2.yaml", ("topological", "network.tmap2.yaml")),
+        ("map.yaml", None),
+        ("other/location/datum.yaml", None),
+    ],
+)
+def test_template_folder(name: str, below: tuple[str, ...] | None) -> None:
+    assert template_folder(name) == below
+
+
+@pytest.mark.parametrize(
+    ("environment", "layers"),
+    [
+        ("indoor-agilex-limo-track", {"occupancy"}),
+        ("riseholme_park_farm_general_east_pathway", {"location", "objects", "topology", "occupancy"}),
+        ("riseholme_park_farm_strawberry_polytunnels", {"location", "objects", "topology", "occupancy"}),
+        ("riseholme_park_farm_vineyard", {"location", "objects", "topology", "occupancy"}),
+    ],
+)
+def test_real_template_folders(shared: Path, facts_json: dict[str, Any], environment: str, layers: set[str]) -> None:
+    root = shared / "data" / "environment_template" / environment
+    files = {p.relative_to(root).as_posix(): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+    bundle = told(files)
+    assert bundle.layers(None).layers == layers
+    for name in files:
+        known = facts_json[f"environment_template/{environment}/{name}"]
+        if known["kind"] == "tmap2" and bundle.files[name].used and "poi" not in name:
+            network = part(bundle, "topology", "network")
+            assert sum(p["kind"] == "node" for p in network.properties) == known["facts"]["nodes"]
+            assert sum(p["kind"] == "edge" for p in network.properties) == known["facts"]["edges_directed"]
+        if known["kind"] == "occupancy_map_yaml" and "metric/map/" in name:
+            grid = bundle.parts[PartKey("occupancy", "ground", "map")]
+            assert grid.counts()["occupied"] == known["facts"]["cells"]["occupied_100"]  # type: ignore[union-attr]
