@@ -12,9 +12,11 @@ from functools import lru_cache
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from pyproj import Proj
+from pyproj import Proj, Transformer
+from pyproj.exceptions import ProjError
 
-from app.model.frame import Datum
+from app.errors import Invalid
+from app.model.frame import MAX_METRES, Datum
 
 Array = NDArray[np.float64]
 
@@ -38,10 +40,19 @@ class LocalFrame:
         """(longitude, latitude[, altitude]) in degrees and metres -> (x, y[, z]) in metres.
 
         A third column passes through: heights are stored as given, relative to what their source says.
+        Raises Invalid for a place so far from the datum that the local frame has no coordinates for it.
         """
         points = np.asarray(lonlat, np.float64)
         out = points.copy()
         east, north = self._proj(points[:, 0], points[:, 1])
+        # Far round the globe the projection has no answer (inf), and metres there would mean nothing.
+        far = ~((np.abs(east) <= MAX_METRES) & (np.abs(north) <= MAX_METRES))
+        if far.any():
+            longitude, latitude = points[np.flatnonzero(far)[0], :2]
+            raise Invalid(
+                f"the place {latitude:g}, {longitude:g} (latitude, longitude) is too far from the datum "
+                f"{self.datum.latitude:g}, {self.datum.longitude:g} for the local frame: correct it or the datum"
+            )
         if self._sin == 0.0 and self._cos == 1.0:
             out[:, 0], out[:, 1] = east, north
         else:
@@ -92,3 +103,22 @@ def _transform(geometry: NDArray[np.object_], function: object) -> NDArray[np.ob
 def local_frame(datum: Datum) -> LocalFrame:
     """The frame of a datum; building one costs PROJ about a millisecond, so they are kept."""
     return LocalFrame(datum)
+
+
+def crs_bounds(crs: str, points: Array) -> tuple[float, float, float, float] | None:
+    """(west, south, east, north) in degrees around points (x, y) of a named CRS; None where PROJ cannot tell.
+
+    points: float64 [n, 2], x first (easting, longitude) whatever the CRS's own order.
+    """
+    try:
+        longitude, latitude = _to_degrees(crs).transform(points[:, 0], points[:, 1])
+    except ProjError:
+        return None
+    if not (np.isfinite(longitude).all() and np.isfinite(latitude).all()):
+        return None
+    return float(longitude.min()), float(latitude.min()), float(longitude.max()), float(latitude.max())
+
+
+@lru_cache(maxsize=64)
+def _to_degrees(crs: str) -> Transformer:
+    return Transformer.from_crs(crs, "EPSG:4326", always_xy=True)

@@ -1,0 +1,314 @@
+"""What differs between two versions of a part: reads only what their trees do not share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.model.grid import FREE, OCCUPIED, UNKNOWN
+from app.store import parts, tree
+from app.store.encode import pack
+from app.store.parts import TILE, Item, PartRoot
+from app.store.tree import Draft
+from app.store.values import Box, Rectangle
+
+
+@dataclass(slots=True)
+class FeatureChanges:
+    """Ids that came, changed and went, sorted, with the items on both sides. document: whether it differs."""
+
+    added: list[str] = field(default_factory=list)
+    changed: list[str] = field(default_factory=list)
+    deleted: list[str] = field(default_factory=list)
+    before: Mapping[str, Item] = field(default_factory=dict)
+    after: Mapping[str, Item] = field(default_factory=dict)
+    document: bool = False
+
+    def counts(self) -> dict[str, int]:
+        """How many of each."""
+        return {"added": len(self.added), "changed": len(self.changed), "deleted": len(self.deleted)}
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's words."""
+        return {
+            "added": self.added,
+            "changed": [{"id": i, "fields": fields(self.before[i], self.after[i])} for i in self.changed],
+            "deleted": self.deleted,
+        }
+
+
+def same_items(a: Item, b: Item) -> bool:
+    """Whether two items are stored as the same bytes: 1 and 1.0 differ."""
+    return (
+        a.anchor == b.anchor
+        and a.wkb == b.wkb
+        and a.properties == b.properties
+        and pack(a.properties) == pack(b.properties)
+    )
+
+
+def fields(a: Item, b: Item) -> list[str]:
+    """Names of the properties that differ, ``geometry`` and ``anchor`` among them, sorted."""
+    out = {
+        key
+        for key in a.properties.keys() | b.properties.keys()
+        if key not in a.properties
+        or key not in b.properties
+        or a.properties[key] != b.properties[key]
+        or pack(a.properties[key]) != pack(b.properties[key])
+    }
+    if a.wkb != b.wkb:
+        out.add("geometry")
+    if a.anchor != b.anchor:
+        out.add("anchor")
+    return sorted(out)
+
+
+def features(draft: Draft, a: PartRoot | None, b: PartRoot | None) -> FeatureChanges:
+    """Changes between two collections; None is one without items."""
+    before: dict[str, Item] = {}
+    after: dict[str, Item] = {}
+    with parts.no_garbage_collection():
+        for anchor, name in enumerate(("local", "wgs84")):
+            left, right = tree.differing(draft, a.trees[name] if a else None, b.trees[name] if b else None)
+            before.update(parts.leaf_items(draft, left, anchor))
+            after.update(parts.leaf_items(draft, right, anchor))
+    return FeatureChanges(
+        sorted(after.keys() - before.keys()),
+        sorted(i for i in after.keys() & before.keys() if not same_items(before[i], after[i])),
+        sorted(before.keys() - after.keys()),
+        before,
+        after,
+        (a.header["document"] if a else []) != (b.header["document"] if b else []),
+    )
+
+
+# --- grids ---
+
+FRAME: Final = ("height", "width", "resolution", "origin")
+
+
+@dataclass(frozen=True, slots=True)
+class TileChange:
+    """A tile that differs: its place in cells of the new grid, and both contents (uint8 [height, width])."""
+
+    row: int
+    column: int
+    before: NDArray[np.uint8]
+    after: NDArray[np.uint8]
+
+
+def same_frame(a: PartRoot, b: PartRoot) -> bool:
+    """Whether two grids have their cells at the same places."""
+    return all(a.header[name] == b.header[name] for name in FRAME)
+
+
+def changed_tiles(draft: Draft, a: PartRoot, b: PartRoot) -> Iterator[TileChange]:
+    """The tiles that differ between two grids of the same frame."""
+    left, right = tree.differing(draft, a.trees["tiles"], b.trees["tiles"])
+    raws = draft.read_many([*left, *right])
+    before = {code: name for leaf in left for code, name in parts.tile_leaf(raws[leaf])}
+    after = {code: name for leaf in right for code, name in parts.tile_leaf(raws[leaf])}
+    codes = [code for code in sorted(after) if before.get(code) != after[code]]
+    for start in range(0, len(codes), parts.TILE_BATCH):
+        some = codes[start : start + parts.TILE_BATCH]
+        raw = draft.stream([*(before[c] for c in some), *(after[c] for c in some)])
+        for code in some:
+            row, column, height, width = parts.tile_shape(b.header, code)
+            yield TileChange(
+                row,
+                column,
+                parts.tile_cells(raw[before[code]]).reshape(height, width),
+                parts.tile_cells(raw[after[code]]).reshape(height, width),
+            )
+
+
+@dataclass(slots=True)
+class CellChanges:
+    """Counts of changed cells by what they became, and the box around them in metres."""
+
+    freed: int = 0
+    blocked: int = 0
+    unknown: int = 0
+    other: int = 0
+    box: Box | None = None
+    fields: list[str] = field(default_factory=list)
+
+    def add(self, before: NDArray[np.uint8], after: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Count the cells that differ; the mask of them."""
+        differs: NDArray[np.bool_] = before != after
+        now = after[differs]
+        freed, blocked, unknown = (int((now == value).sum()) for value in (FREE, OCCUPIED, UNKNOWN))
+        self.freed += freed
+        self.blocked += blocked
+        self.unknown += unknown
+        self.other += len(now) - freed - blocked - unknown
+        return differs
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-like: all counts, the box, and the names of header members that differ, if any."""
+        out: dict[str, Any] = {
+            "freed": self.freed,
+            "blocked": self.blocked,
+            "unknown": self.unknown,
+            "other": self.other,
+            "bbox": None if self.box is None else list(self.box),
+        }
+        if self.fields:
+            out["fields"] = self.fields
+        return out
+
+
+def cells(draft: Draft, a: PartRoot | None, b: PartRoot | None) -> CellChanges:
+    """Changes between two grids. Outside of a grid cells count as unknown.
+
+    Grids whose cells fall on the same raster (equal resolution and yaw, origins whole cells apart) are laid on each
+    other; of others only the header's differences and the box of the new one (or of the old one) are told.
+    """
+    out = CellChanges()
+    if a is None and b is None:
+        return out
+    if a is not None and b is not None:
+        out.fields = sorted(k for k in a.header.keys() | b.header.keys() if a.header.get(k) != b.header.get(k))
+        if same_frame(a, b):
+            low = np.array([math.inf, math.inf])
+            high = -low
+            for change in changed_tiles(draft, a, b):
+                rows, columns = np.nonzero(out.add(change.before, change.after))
+                if len(rows):
+                    low = np.minimum(low, [columns.min() + change.column, rows.min() + change.row])
+                    high = np.maximum(high, [columns.max() + change.column + 1, rows.max() + change.row + 1])
+            if math.isfinite(low[0]):
+                out.box = _cell_box(b.header, *low.tolist(), *high.tolist())
+            return out
+        if _offset(a.header, b.header) is None:
+            out.box = _cell_box(b.header, 0, 0, b.header["width"], b.header["height"])
+            return out
+    return _laid_over(draft, a, b, out)
+
+
+def _laid_over(draft: Draft, a: PartRoot | None, b: PartRoot | None, out: CellChanges) -> CellChanges:
+    """Compare grids of one raster on the rectangle around both, in blocks of rows."""
+    header = b.header if b else a.header if a else {}
+    place = (0, 0) if a is None or b is None else (_offset(a.header, b.header) or (0, 0))
+    old = _all_cells(draft, a)
+    new = _all_cells(draft, b)
+    # (row, column) of each grid's first cell in cells of the new one.
+    old_row, old_column = place if b is not None else (0, 0)
+    spans = [(old_row, old_column, old)] * (a is not None) + [(0, 0, new)] * (b is not None)
+    r0 = min(r for r, _, _ in spans)
+    c0 = min(c for _, c, _ in spans)
+    r1 = max(r + g.shape[0] for r, _, g in spans)
+    c1 = max(c + g.shape[1] for _, c, g in spans)
+    low = np.array([math.inf, math.inf])
+    high = -low
+    for start in range(r0, r1, TILE):
+        end = min(start + TILE, r1)
+        before = _window(old, old_row, old_column, start, end, c0, c1) if a is not None else None
+        after = _window(new, 0, 0, start, end, c0, c1) if b is not None else None
+        blank = np.full((end - start, c1 - c0), UNKNOWN, np.uint8)
+        rows, columns = np.nonzero(out.add(blank if before is None else before, blank if after is None else after))
+        if len(rows):
+            low = np.minimum(low, [columns.min() + c0, rows.min() + start])
+            high = np.maximum(high, [columns.max() + c0 + 1, rows.max() + start + 1])
+    if math.isfinite(low[0]):
+        out.box = _cell_box(header, *low.tolist(), *high.tolist())
+    return out
+
+
+def _window(
+    grid: NDArray[np.uint8], row: int, column: int, start: int, end: int, left: int, right: int
+) -> NDArray[np.uint8]:
+    """Rows [start, end) and columns [left, right) of a grid whose first cell is (row, column); unknown outside."""
+    out = np.full((end - start, right - left), UNKNOWN, np.uint8)
+    r0, r1 = max(start, row), min(end, row + grid.shape[0])
+    if r0 < r1:
+        out[r0 - start : r1 - start, column - left : column - left + grid.shape[1]] = grid[r0 - row : r1 - row]
+    return out
+
+
+def _all_cells(draft: Draft, root: PartRoot | None) -> NDArray[np.uint8]:
+    return parts.grid_cells(draft, root) if root else np.empty((0, 0), np.uint8)
+
+
+def _offset(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[int, int] | None:
+    """(row, column) of a's first cell in cells of b, where both lie on one raster; else None."""
+    ax, ay, ayaw = a["origin"]
+    bx, by, byaw = b["origin"]
+    if a["resolution"] != b["resolution"] or ayaw != byaw:
+        return None
+    c, s = math.cos(byaw), math.sin(byaw)
+    column = (c * (ax - bx) + s * (ay - by)) / b["resolution"]
+    row = (c * (ay - by) - s * (ax - bx)) / b["resolution"]
+    far = abs(column) > 1e5 or abs(row) > 1e5
+    if far or abs(column - round(column)) > 1e-3 or abs(row - round(row)) > 1e-3:
+        return None
+    return round(row), round(column)
+
+
+def _cell_box(header: Mapping[str, Any], x0: float, y0: float, x1: float, y1: float) -> Box:
+    """The box in metres around cells [x0, x1) × [y0, y1) of a grid."""
+    x, y, yaw = header["origin"]
+    r = header["resolution"]
+    c, s = math.cos(yaw), math.sin(yaw)
+    corners = [(u * r, v * r) for u, v in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+    xs = [x + c * u - s * v for u, v in corners]
+    ys = [y + s * u + c * v for u, v in corners]
+    return (min(xs), min(ys), max(xs), max(ys))
+
+
+def rectangles(draft: Draft, a: PartRoot, b: PartRoot) -> tuple[Rectangle, ...]:
+    """The changed cells between two grids of one frame: the smallest rectangle in each tile that differs."""
+    out = []
+    for change in changed_tiles(draft, a, b):
+        rows, columns = np.nonzero(change.before != change.after)
+        r0, r1, c0, c1 = int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1
+        block = np.ascontiguousarray(change.after[r0:r1, c0:c1])
+        out.append(Rectangle(change.row + r0, change.column + c0, block))
+    return tuple(out)
+
+
+# --- the other layers ---
+
+
+def others(draft: Draft, a: PartRoot | None, b: PartRoot | None) -> dict[str, Any]:
+    """Voxels, tiles of a picture, or files that came, changed and went, and the header members that differ."""
+    if a is not None and b is not None and a.type != b.type:
+        a = None
+    kind = b.type if b else a.type if a else "resources"
+    name = {"voxels": "voxels", "picture": "tiles", "resources": "files"}[kind]
+    left, right = tree.differing(draft, a.trees[name] if a else None, b.trees[name] if b else None)
+    before, after = _rows(draft, left, a), _rows(draft, right, b)
+    out: dict[str, Any] = {
+        "added": len(after.keys() - before.keys()),
+        "changed": sum(1 for k in after.keys() & before.keys() if before[k] != after[k]),
+        "deleted": len(before.keys() - after.keys()),
+    }
+    if a is not None and b is not None:
+        header = sorted(k for k in a.header.keys() | b.header.keys() if a.header.get(k) != b.header.get(k))
+        if header:
+            out["fields"] = header
+    return out
+
+
+def _rows(draft: Draft, names: Sequence[bytes], root: PartRoot | None) -> dict[Any, Any]:
+    rows: dict[Any, Any] = {}
+    for start in range(0, len(names), parts.TILE_BATCH):
+        some = names[start : start + parts.TILE_BATCH]
+        raws = draft.stream(some)
+        for name in some:
+            if root is not None and root.type == "voxels":
+                depth, code, log_odds, shades = parts.voxel_leaf(raws[name], root.header["colour"])
+                tints = [b""] * len(code) if shades is None else [bytes(s) for s in shades]
+                keys = zip(depth.tolist(), code.tolist(), strict=True)
+                rows.update(zip(keys, zip(log_odds.tolist(), tints, strict=True), strict=True))
+            elif root is not None and root.type == "picture":
+                rows.update(parts.tile_leaf(raws[name]))
+            else:
+                rows.update((path, sha) for path, _, sha in parts.file_leaf(raws[name]))
+    return rows

@@ -1,0 +1,320 @@
+"""The tables, one model for SQLite and PostgreSQL. Migrations make them; a test holds both equal.
+
+Geometry is PostGIS' ``geometry`` (GiST index) on PostgreSQL and WKB on SQLite, beside four bounding-box columns on both.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from geoalchemy2 import Geometry
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    Column,
+    DateTime,
+    Dialect,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+    func,
+)
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.elements import BindParameter, ColumnElement
+from sqlalchemy.sql.functions import FunctionElement
+from sqlalchemy.types import TypeDecorator, TypeEngine
+
+
+class Moment(TypeDecorator[datetime]):
+    """An aware time in UTC; SQLite keeps it without the zone."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Any zone -> UTC."""
+        if value is None:
+            return None
+        utc = value.astimezone(UTC)
+        return utc.replace(tzinfo=None) if dialect.name == "sqlite" else utc
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Aware, in UTC."""
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+class _PlainGeometry(Geometry):
+    """PostGIS' column type without GeoAlchemy2's conversions of values: ours are WKB in and out."""
+
+    cache_ok = True
+
+    def bind_processor(self, dialect: Dialect) -> None:
+        """Values are bytes already."""
+
+    def result_processor(self, dialect: Dialect, coltype: object) -> None:
+        """Values stay bytes."""
+
+    def bind_expression(self, bindvalue: BindParameter[Any]) -> None:
+        """Places does it, by dialect."""
+
+    def column_expression(self, col: ColumnElement[Any]) -> ColumnElement[Any]:
+        """Places does it, by dialect."""
+        return col
+
+
+class from_wkb(FunctionElement[bytes]):  # noqa: N801 - an SQL function
+    """WKB in degrees -> the column's form."""
+
+    inherit_cache = True
+
+
+class as_wkb(FunctionElement[bytes]):  # noqa: N801 - an SQL function
+    """The column's form -> WKB."""
+
+    inherit_cache = True
+
+
+@compiles(from_wkb)
+@compiles(as_wkb)
+def _as_is(element: FunctionElement[bytes], compiler: Any, **kw: Any) -> str:
+    return str(compiler.process(next(iter(element.clauses)), **kw))
+
+
+@compiles(from_wkb, "postgresql")
+def _from_wkb(element: from_wkb, compiler: Any, **kw: Any) -> str:
+    return f"ST_GeomFromWKB({compiler.process(next(iter(element.clauses)), **kw)}, 4326)"
+
+
+@compiles(as_wkb, "postgresql")
+def _as_wkb(element: as_wkb, compiler: Any, **kw: Any) -> str:
+    return f"ST_AsBinary({compiler.process(next(iter(element.clauses)), **kw)})"
+
+
+class Place(TypeDecorator[bytes]):
+    """A geometry in degrees (WGS 84): WKB in and out; PostGIS' type on PostgreSQL, bytes on SQLite."""
+
+    impl = _PlainGeometry
+    cache_ok = True
+
+    def __init__(self) -> None:
+        super().__init__(geometry_type="GEOMETRY", srid=4326, spatial_index=False)
+
+    def load_dialect_impl(self, dialect: Dialect | None) -> TypeEngine[Any]:
+        """PostGIS' type on PostgreSQL alone (SQLAlchemy also asks without a dialect)."""
+        if dialect is not None and dialect.name == "postgresql":
+            return _PlainGeometry(geometry_type="GEOMETRY", srid=4326, spatial_index=False)
+        return LargeBinary()
+
+    def bind_expression(self, bindparam: BindParameter[Any]) -> ColumnElement[Any]:
+        """WKB -> the column's form."""
+        return from_wkb(bindparam)
+
+    def column_expression(self, column: ColumnElement[Any]) -> ColumnElement[Any]:
+        """The column's form -> WKB."""
+        return as_wkb(column)
+
+
+def _box() -> list[Column[float]]:
+    """Degrees; west > east crosses the antimeridian."""
+    return [Column(name, Float(53), nullable=True) for name in ("west", "south", "east", "north")]
+
+
+metadata = MetaData(
+    naming_convention={
+        "ix": "ix_%(table_name)s_%(column_0_name)s",
+        "uq": "uq_%(table_name)s_%(column_0_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+
+
+def _environment(**options: Any) -> Column[str]:
+    return Column("environment_id", String(32), ForeignKey("environment.id", ondelete="CASCADE"), **options)
+
+
+environment = Table(
+    "environment",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("name", String(63), nullable=False, unique=True),
+    Column("title", Text, nullable=False),
+    Column("description", Text, nullable=False),
+    Column("tags", JSON, nullable=False),
+    Column("head", Integer, nullable=False),
+    Column("root", String(64), nullable=False),
+    Column("sequence", BigInteger, nullable=False),
+    Column("datum", JSON(none_as_null=True), nullable=True),
+    Column("indexed", Integer, nullable=False),
+    Column("created", Moment, nullable=False),
+    Column("updated", Moment, nullable=False),
+    Column("deleted", Moment, nullable=True),
+    *_box(),
+    Column("extent", Place, nullable=True),
+)
+"""head and root: of the newest version. sequence: of the last event. indexed: the version that ``place`` shows."""
+
+Index("ix_environment_extent", environment.c.extent, postgresql_using="gist").ddl_if(dialect="postgresql")
+Index("ix_environment_box", environment.c.south, environment.c.north, environment.c.west, environment.c.east)
+
+version = Table(
+    "version",
+    metadata,
+    _environment(primary_key=True),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("root", String(64), nullable=False),
+    Column("parent", Integer, nullable=True),
+    Column("author", Text, nullable=False),
+    Column("message", Text, nullable=False),
+    Column("time", Moment, nullable=False),
+    Column("sequence", BigInteger, nullable=False),
+    Column("changes", JSON, nullable=False),
+    Column("warnings", JSON, nullable=False),
+    Column("manifest", LargeBinary, nullable=False),
+)
+"""manifest: datum, levels and parts, as ``versions.py`` packs them. sequence: of the event that told of it."""
+
+source = Table(
+    "source",
+    metadata,
+    _environment(primary_key=True),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("position", Integer, primary_key=True, autoincrement=False),
+    Column("name", Text, nullable=False),
+    Column("size", BigInteger, nullable=False),
+    Column("sha256", String(64), nullable=False, index=True),
+    Column("format", Text, nullable=True),
+    Column("used", Boolean, nullable=False),
+)
+"""The files of a version, in the order they came."""
+
+chunk = Table(
+    "chunk",
+    metadata,
+    Column("hash", LargeBinary(32), primary_key=True),
+    Column("data", LargeBinary, nullable=False),
+    Column("used", BigInteger, nullable=False, index=True),
+)
+"""Chunks by the hash of their canonical bytes; data is compressed. used: when it was last written or written again
+(seconds since 1970), so that collection leaves alone what an upload in progress relies on."""
+
+blob = Table(
+    "blob",
+    metadata,
+    Column("sha256", String(64), primary_key=True),
+    Column("size", BigInteger, nullable=False),
+    Column("pack", String(64), nullable=True, index=True),
+    Column("start", BigInteger, nullable=False),
+    Column("used", BigInteger, nullable=False, index=True),
+)
+"""Files by the hash of their content. pack: the file that holds it among others, from byte ``start`` on; NULL where it
+is a file of its own."""
+
+channel = Table(
+    "channel",
+    metadata,
+    _environment(primary_key=True),
+    Column("name", String(63), primary_key=True),
+    Column("version", Integer, nullable=True),
+    Column("sequence", BigInteger, nullable=False),
+    Column("author", Text, nullable=False),
+    Column("time", Moment, nullable=False),
+    Column("planned_version", Integer, nullable=True),
+    Column("planned_at", Moment, nullable=True, index=True),
+    Column("planned_author", Text, nullable=True),
+)
+
+event = Table(
+    "event",
+    metadata,
+    Column("position", BigInteger, primary_key=True, autoincrement=False),
+    Column("environment_id", String(32), nullable=False),
+    Column("environment", String(63), nullable=False),
+    Column("sequence", BigInteger, nullable=False),
+    Column("body", JSON, nullable=False),
+    Column("time", Moment, nullable=False),
+    Index("uq_event_sequence", "environment_id", "sequence", unique=True),
+)
+"""The outbox, which is the log. Rows outlive their environment, so that its end is still told after a purge."""
+
+log = Table(
+    "log",
+    metadata,
+    Column("id", Integer, primary_key=True, autoincrement=False),
+    Column("position", BigInteger, nullable=False),
+)
+"""One row: the position of the newest event. Its lock puts the events of all environments in one order."""
+
+retired = Table(
+    "retired",
+    metadata,
+    Column("name", String(63), primary_key=True),
+    Column("sequence", BigInteger, nullable=False),
+)
+"""Names that an environment gave up, with the last sequence told under them: a new one goes on from there, since robots
+refuse a lower sequence."""
+
+idempotency = Table(
+    "idempotency",
+    metadata,
+    _environment(primary_key=True),
+    Column("key", String(255), primary_key=True),
+    Column("fingerprint", Text, nullable=False),
+    Column("version", Integer, nullable=False),
+    Column("time", Moment, nullable=False),
+)
+
+token = Table(
+    "token",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("hash", String(64), nullable=False, unique=True),
+    Column("name", Text, nullable=False),
+    Column("role", String(16), nullable=False),
+    Column("environments", Text, nullable=True),
+    Column("robot", Text, nullable=True),
+    Column("expires", Moment, nullable=True),
+    Column("created", Moment, nullable=False),
+)
+
+job = Table(
+    "job",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    Column("state", String(16), nullable=False),
+    Column("progress", Float(53), nullable=False),
+    Column("detail", Text, nullable=False),
+    Column("result", JSON(none_as_null=True), nullable=True),
+    Column("problem", JSON(none_as_null=True), nullable=True),
+    Column("owner", Text, nullable=False),
+    Column("created", Moment, nullable=False),
+    Column("updated", Moment, nullable=False),
+)
+
+place = Table(
+    "place",
+    metadata,
+    _environment(primary_key=True),
+    Column("layer", String(16), primary_key=True),
+    Column("level", String(256), primary_key=True),
+    Column("name", String(256), primary_key=True),
+    Column("feature", String(512), primary_key=True),
+    *_box(),
+    Column("geometry", Place, nullable=False),
+)
+"""The heads' vector items on earth, for questions across environments. It can be rebuilt from the trees at any time."""
+
+Index("ix_place_geometry", place.c.geometry, postgresql_using="gist").ddl_if(dialect="postgresql")
+Index("ix_place_box", place.c.south, place.c.north, place.c.west, place.c.east)
+
+__all__ = ["func", "metadata"]

@@ -1,0 +1,544 @@
+"""The chunk tree: a sorted sequence of items cut into content-addressed nodes, independent of its history.
+
+Where the sequence is cut depends on the items' keys alone: a key whose hash at its level has ``bits`` low zero bits
+ends its node (2^bits items on average). A node that would hold more than four times as many is cut again where fewer
+bits are zero, and so on. The nodes' last keys are the sequence of the next level, until one node is left: the root. So
+equal items have equal roots, an edit rewrites the few nodes on its path, and two trees share every node that lies
+between their differences. It is the idea of the prolly trees of Noms and Dolt.
+
+The key's hash is public (CRC-32, mixed with the level), so whoever chooses ids could make every item a node of its own
+and slow down his own environment: more than 64 + n/8 leaves for n items are refused.
+"""
+
+from __future__ import annotations
+
+import zlib
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import Damaged, Invalid
+from app.store.encode import ENCODING, NOWHERE, compress, decompress, digest, pack, unpack
+
+FANOUT_BITS: Final = 6
+"""An inner node has 64 children on average."""
+
+OVERSIZE: Final = 4
+"""Nodes with more than this many times the average are cut again."""
+
+TOP: Final = 12
+"""A level at which everything goes into one node, so that no choice of keys makes an endless tower."""
+
+Box = tuple[float, float, float, float]
+
+
+class Source(Protocol):
+    """Where chunks are read."""
+
+    def read_many(self, hashes: Sequence[bytes]) -> Mapping[bytes, bytes]:
+        """Hash -> canonical bytes; Damaged where one is missing or wrong."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A reference to a node: its level (0 = leaf), items and leaves below, and the box around them."""
+
+    hash: bytes
+    level: int
+    count: int
+    leaves: int
+    box: Box
+    key: bytes = b""
+
+    def as_list(self) -> list[Any]:
+        """For a part's chunk."""
+        box = None if self.box == NOWHERE else list(self.box)
+        return [self.hash, self.level, self.count, self.leaves, box]
+
+    @classmethod
+    def from_list(cls, members: Sequence[Any] | None) -> Node | None:
+        """The reverse; None for an empty tree."""
+        if members is None:
+            return None
+        h, level, count, leaves, box = members
+        return cls(h, level, count, leaves, NOWHERE if box is None else tuple(box))
+
+
+@dataclass(frozen=True, slots=True)
+class Inner:
+    """A decoded inner node. keys: ascending last keys of the children."""
+
+    level: int
+    keys: list[bytes]
+    hashes: list[bytes]
+    counts: list[int]
+    leaves: list[int]
+    boxes: NDArray[np.float64]
+
+    def child(self, k: int) -> Node:
+        """A reference to child k."""
+        x0, y0, x1, y1 = self.boxes[k].tolist()
+        return Node(self.hashes[k], self.level - 1, self.counts[k], self.leaves[k], (x0, y0, x1, y1), key=self.keys[k])
+
+    def children(self) -> list[Node]:
+        """All of them."""
+        return [self.child(k) for k in range(len(self.keys))]
+
+
+def decode_inner(raw: bytes) -> Inner:
+    """The canonical bytes of an inner node -> its members."""
+    members = unpack(raw)
+    if members[1] != "inner":
+        raise Damaged(f"a stored chunk is {members[1]!r} where an inner node belongs")
+    _, _, level, keys, hashes, counts, leaves, boxes = members
+    n = len(keys)
+    return Inner(
+        level,
+        keys,
+        [hashes[32 * k : 32 * k + 32] for k in range(n)],
+        counts,
+        leaves,
+        np.frombuffer(boxes, "<f8").reshape(n, 4),
+    )
+
+
+def encode_inner(level: int, children: Sequence[Node]) -> bytes:
+    """The reverse."""
+    boxes = np.array([c.box for c in children], "<f8")
+    return pack(
+        [
+            ENCODING,
+            "inner",
+            level,
+            [c.key for c in children],
+            b"".join(c.hash for c in children),
+            [c.count for c in children],
+            [c.leaves for c in children],
+            boxes.tobytes(),
+        ]
+    )
+
+
+class Draft:
+    """Chunks in the making over the stored ones. What is read is kept, so one operation reads nothing twice."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self.new: dict[bytes, bytes] = {}
+        self.stored: dict[bytes, bytes] = {}
+        self._read: dict[bytes, bytes] = {}
+        self._inner: dict[bytes, Inner] = {}
+
+    def put(self, raw: bytes) -> bytes:
+        """Keep a chunk; its hash."""
+        name = digest(raw)
+        self.new[name] = raw
+        return name
+
+    def put_big(self, raw: bytes, known: Container[bytes]) -> bytes:
+        """Keep a chunk compressed, unless its hash is among the known ones; its hash."""
+        name = digest(raw)
+        if name not in known and name not in self.stored:
+            self.stored[name] = compress(raw)
+        return name
+
+    def read_many(self, hashes: Sequence[bytes]) -> dict[bytes, bytes]:
+        """Hash -> canonical bytes, one query for all that are not at hand."""
+        missing = [h for h in dict.fromkeys(hashes) if h not in self.new and h not in self._read]
+        if missing:
+            self._read.update(self.stream(missing))
+        return {h: self.new[h] if h in self.new else self._read[h] for h in hashes}
+
+    def stream(self, hashes: Sequence[bytes]) -> dict[bytes, bytes]:
+        """The same, but nothing is kept."""
+        out = {h: self.new[h] for h in hashes if h in self.new}
+        out.update((h, decompress(self.stored[h])) for h in hashes if h in self.stored)
+        missing = [h for h in dict.fromkeys(hashes) if h not in out]
+        if missing:
+            out.update(self._source.read_many(missing))
+        return out
+
+    def was_read(self, name: bytes) -> bool:
+        """Whether this chunk came from the store."""
+        return name in self._read
+
+    def read(self, name: bytes) -> bytes:
+        """One chunk."""
+        return self.read_many([name])[name]
+
+    def inner(self, name: bytes) -> Inner:
+        """One inner node."""
+        known = self._inner.get(name)
+        if known is None:
+            known = self._inner[name] = decode_inner(self.read(name))
+        return known
+
+
+# --- where to cut ---
+
+
+def key_hashes(keys: Iterable[bytes], level: int) -> NDArray[np.uint32]:
+    """The public hash of each key at a level: CRC-32 plus level · 0x9E3779B9, through MurmurHash3's finaliser."""
+    crc = np.fromiter(map(zlib.crc32, keys), np.uint32)
+    h = crc + np.uint32((level * 0x9E3779B9) & 0xFFFFFFFF)
+    h ^= h >> np.uint32(16)
+    h *= np.uint32(0x85EBCA6B)
+    h ^= h >> np.uint32(13)
+    h *= np.uint32(0xC2B2AE35)
+    h ^= h >> np.uint32(16)
+    return h
+
+
+def cut(hashes: NDArray[np.uint32], bits: int, limit: int | None = None) -> list[int]:
+    """The ends (exclusive) of the nodes of a sequence of keys with these hashes."""
+    n = len(hashes)
+    if limit is None:
+        limit = OVERSIZE << bits
+    ends = np.flatnonzero((hashes & np.uint32((1 << bits) - 1)) == 0) + 1
+    out: list[int] = []
+    start = 0
+    for end in [*ends.tolist(), n]:
+        if end == start:
+            continue
+        if end - start > limit and bits:
+            out.extend(start + e for e in cut(hashes[start:end], bits - 1, limit))
+        else:
+            out.append(end)
+        start = end
+    return out
+
+
+def ends_node(key: bytes, level: int, bits: int) -> bool:
+    """Whether this key ends its node (by the full number of bits), so that nothing before touches what is after."""
+    return level < TOP and not int(key_hashes((key,), level)[0]) & ((1 << bits) - 1)
+
+
+# --- building ---
+
+
+def build(
+    draft: Draft,
+    keys: Sequence[bytes],
+    bits: int,
+    encode: Callable[[int, int], bytes],
+    boxes: NDArray[np.float64] | None = None,
+) -> Node | None:
+    """A tree of sorted distinct keys. encode(start, end) gives a leaf's bytes; boxes: float64 [n, 4] or None."""
+    if not keys:
+        return None
+    ends = cut(key_hashes(keys, 0), bits)
+    starts = [0, *ends[:-1]]
+    around = join_boxes(boxes, starts) if boxes is not None else [NOWHERE] * len(ends)
+    leaves = [
+        Node(draft.put(encode(s, e)), 0, e - s, 1, box, key=keys[e - 1])
+        for s, e, box in zip(starts, ends, around, strict=True)
+    ]
+    root = raise_tree(draft, leaves, 1)
+    check_leaves(root)
+    return root
+
+
+def join_boxes(boxes: NDArray[np.float64], starts: Sequence[int]) -> list[Box]:
+    """The box around each run of boxes."""
+    low = np.minimum.reduceat(boxes[:, :2], starts, axis=0)
+    high = np.maximum.reduceat(boxes[:, 2:], starts, axis=0)
+    return [(a, b, c, d) for (a, b), (c, d) in zip(low.tolist(), high.tolist(), strict=True)]
+
+
+def inner_nodes(draft: Draft, children: Sequence[Node], level: int) -> list[Node]:
+    """Group the nodes of the level below into inner nodes of this level."""
+    ends = cut(key_hashes((c.key for c in children), level), FANOUT_BITS) if level < TOP else [len(children)]
+    out = []
+    start = 0
+    for end in ends:
+        group = children[start:end]
+        boxes = np.array([c.box for c in group])
+        (box,) = join_boxes(boxes, [0])
+        name = draft.put(encode_inner(level, group))
+        count, leaves = sum(c.count for c in group), sum(c.leaves for c in group)
+        out.append(Node(name, level, count, leaves, box, key=group[-1].key))
+        start = end
+    return out
+
+
+def raise_tree(draft: Draft, nodes: list[Node], level: int) -> Node:
+    """Inner levels above these nodes, until one is left."""
+    while len(nodes) > 1:
+        nodes = inner_nodes(draft, nodes, level)
+        level += 1
+    return nodes[0]
+
+
+def check_leaves(root: Node | None) -> None:
+    """Invalid where keys were chosen so that leaves become tiny."""
+    if root is not None and root.leaves > 64 + root.count // 8:
+        raise Invalid(
+            f"{root.count} items would need {root.leaves} leaves of storage: their ids are chosen such that "
+            "nearly each one ends a leaf. Use other ids (at most 64 leaves and one more for each 8 items are stored)"
+        )
+
+
+# --- reading ---
+
+
+def leaves(draft: Draft, roots: Sequence[Node]) -> list[list[bytes]]:
+    """The hashes of each tree's leaves, in order; one query for each level of the tallest."""
+    frontier: list[list[Node]] = [[root] for root in roots]
+    while any(node.level for nodes in frontier for node in nodes):
+        draft.read_many([node.hash for nodes in frontier for node in nodes if node.level])
+        frontier = [
+            [c for node in nodes for c in (draft.inner(node.hash).children() if node.level else (node,))]
+            for nodes in frontier
+        ]
+    return [[node.hash for node in nodes] for nodes in frontier]
+
+
+def select(draft: Draft, root: Node | None, wanted: Callable[[NDArray[np.float64]], NDArray[np.bool_]]) -> list[bytes]:
+    """The hashes of the leaves whose box passes: wanted(boxes float64 [n, 4]) -> bool [n]."""
+    if root is None or not bool(wanted(np.array([root.box]))[0]):
+        return []
+    nodes = [root.hash]
+    for _ in range(root.level):
+        draft.read_many(nodes)
+        chosen: list[bytes] = []
+        for name in nodes:
+            inner = draft.inner(name)
+            chosen.extend(inner.hashes[k] for k in np.flatnonzero(wanted(inner.boxes)).tolist())
+        nodes = chosen
+    return nodes
+
+
+def paths(draft: Draft, root: Node | None, keys: Sequence[bytes]) -> list[bytes]:
+    """The hashes of the leaves in which these sorted keys are, or would be; all nodes on the way are read."""
+    if root is None or not keys:
+        return []
+    frontier: list[tuple[bytes, Sequence[bytes]]] = [(root.hash, keys)]
+    for _ in range(root.level):
+        draft.read_many([name for name, _ in frontier])
+        following: list[tuple[bytes, Sequence[bytes]]] = []
+        for name, some in frontier:
+            inner = draft.inner(name)
+            last = len(inner.keys) - 1
+            start = 0
+            while start < len(some):
+                k = min(bisect_left(inner.keys, some[start]), last)
+                end = len(some) if k == last else bisect_right(some, inner.keys[k], lo=start)
+                following.append((inner.hashes[k], some[start:end]))
+                start = end
+        frontier = following
+    names = [name for name, _ in frontier]
+    draft.read_many(names)
+    return names
+
+
+def differing(draft: Draft, a: Node | None, b: Node | None) -> tuple[list[bytes], list[bytes]]:
+    """Leaves of a that b does not have, and the reverse: reads nothing below equal nodes."""
+    left, right = [a] if a else [], [b] if b else []
+    while True:
+        common = {n.hash for n in left} & {n.hash for n in right}
+        left = [n for n in left if n.hash not in common]
+        right = [n for n in right if n.hash not in common]
+        level = max((n.level for n in (*left, *right)), default=0)
+        if level == 0:
+            return [n.hash for n in left], [n.hash for n in right]
+        draft.read_many([n.hash for n in (*left, *right) if n.level == level])
+        left, right = (
+            [c for n in side for c in (draft.inner(n.hash).children() if n.level == level else (n,))]
+            for side in (left, right)
+        )
+
+
+def names(draft: Draft, root: Node | None) -> set[bytes]:
+    """The hashes of all nodes of a tree; leaves are named by their parents and not read."""
+    out: set[bytes] = set()
+    nodes = [root] if root else []
+    while nodes:
+        out.update(n.hash for n in nodes)
+        inner = [n for n in nodes if n.level]
+        draft.read_many([n.hash for n in inner])
+        nodes = [c for n in inner for c in draft.inner(n.hash).children()]
+    return out
+
+
+# --- editing ---
+
+
+class LeafCodec(Protocol):
+    """How the leaves of one kind of tree are taken apart and put together."""
+
+    bits: int
+
+    def decode(self, raw: bytes) -> tuple[list[bytes], list[Any]]:
+        """A leaf's keys and items."""
+        ...
+
+    def encode(self, keys: Sequence[bytes], items: Sequence[Any]) -> bytes:
+        """A leaf's bytes."""
+        ...
+
+    def boxes(self, items: Sequence[Any]) -> NDArray[np.float64] | None:
+        """The items' boxes, float64 [n, 4], or None where they have no place."""
+        ...
+
+
+def edit(
+    draft: Draft, codec: LeafCodec, root: Node | None, put: Mapping[bytes, Any], removed: Iterable[bytes]
+) -> Node | None:
+    """The tree with items put (added or replaced by key) and keys removed: the very tree that building anew gives."""
+    gone = set(removed) - put.keys()
+    if not put and not gone:
+        return root
+    if root is None:
+        keys = sorted(put)
+        items = [put[k] for k in keys]
+        return build(draft, keys, codec.bits, lambda s, e: codec.encode(keys[s:e], items[s:e]), codec.boxes(items))
+    touched = sorted(gone | put.keys())
+    paths(draft, root, touched)
+
+    def regroup_leaves(old: Sequence[Node], lo: bytes | None, hi: bytes | None) -> list[Node]:
+        merged: dict[bytes, Any] = {}
+        for name, raw in draft.read_many([n.hash for n in old]).items():
+            del name
+            merged.update(zip(*codec.decode(raw), strict=True))
+        for key in _between(touched, lo, hi):
+            if key in put:
+                merged[key] = put[key]
+            else:
+                merged.pop(key, None)
+        if not merged:
+            return []
+        keys = sorted(merged)
+        items = [merged[k] for k in keys]
+        ends = cut(key_hashes(keys, 0), codec.bits)
+        starts = [0, *ends[:-1]]
+        boxes = codec.boxes(items)
+        around = join_boxes(boxes, starts) if boxes is not None else [NOWHERE] * len(ends)
+        return [
+            Node(draft.put(codec.encode(keys[s:e], items[s:e])), 0, e - s, 1, box, key=keys[e - 1])
+            for s, e, box in zip(starts, ends, around, strict=True)
+        ]
+
+    new, old_keys, all_nodes = _edit_level(draft, root, 0, codec.bits, touched, gone, regroup_leaves)
+    level = 0
+    while level < root.level:
+        level += 1
+        fresh = {n.key: n for n in new}
+        lost = old_keys - fresh.keys()
+        touched_now = sorted(lost | fresh.keys())
+        at = level
+
+        def regroup_inner(
+            old: Sequence[Node],
+            lo: bytes | None,
+            hi: bytes | None,
+            *,
+            fresh: dict[bytes, Node] = fresh,
+            touched_now: list[bytes] = touched_now,
+            at: int = at,
+        ) -> list[Node]:
+            merged = {c.key: c for n in old for c in draft.inner(n.hash).children()}
+            for key in _between(touched_now, lo, hi):
+                if key in fresh:
+                    merged[key] = fresh[key]
+                else:
+                    merged.pop(key, None)
+            return inner_nodes(draft, [merged[k] for k in sorted(merged)], at) if merged else []
+
+        new, old_keys, all_nodes = _edit_level(draft, root, level, FANOUT_BITS, touched_now, lost, regroup_inner)
+    assert all_nodes
+    if not new:
+        return None
+    top = raise_tree(draft, new, level + 1)
+    while top.level:
+        inner = draft.inner(top.hash)
+        if len(inner.keys) > 1:
+            break
+        top = inner.child(0)
+    check_leaves(top)
+    return top
+
+
+def _between(keys: Sequence[bytes], lo: bytes | None, hi: bytes | None) -> Sequence[bytes]:
+    """The sorted keys in (lo, hi]; None is no bound."""
+    return keys[0 if lo is None else bisect_right(keys, lo) : len(keys) if hi is None else bisect_right(keys, hi)]
+
+
+def _edit_level(
+    draft: Draft,
+    root: Node,
+    level: int,
+    bits: int,
+    touched: Sequence[bytes],
+    gone: set[bytes],
+    regroup: Callable[[Sequence[Node], bytes | None, bytes | None], list[Node]],
+) -> tuple[list[Node], set[bytes], bool]:
+    """Regroup the runs of nodes of a level that these sorted keys touch.
+
+    A run starts after a key that ends its node by the full number of bits and ends with one that stays, or with the
+    sequence. Returns the new nodes, the last keys of the nodes they stand for, and whether those were all of the level.
+    """
+    if level == root.level:
+        last = draft.inner(root.hash).keys[-1] if root.level else b""
+        return regroup([root], None, None), {last}, True
+    new: list[Node] = []
+    old_keys: set[bytes] = set()
+    done: bytes | None = None
+    finished = False
+    for key in touched:
+        if finished or (done is not None and key <= done):
+            continue
+        first = _first(draft, root, level, key) or _last(draft, root, level)
+        run = [first]
+        while (before := _before(draft, root, level, run[0].key)) and not ends_node(before.key, level, bits):
+            run.insert(0, before)
+        while not (ends_node(run[-1].key, level, bits) and run[-1].key not in gone):
+            after = _first(draft, root, level, run[-1].key, strict=True)
+            if after is None:
+                break
+            run.append(after)
+        before = _before(draft, root, level, run[0].key)
+        finished = _first(draft, root, level, run[-1].key, strict=True) is None
+        done = run[-1].key
+        new.extend(regroup(run, before.key if before else None, None if finished else done))
+        old_keys.update(n.key for n in run)
+    return new, old_keys, False
+
+
+def _first(draft: Draft, root: Node, level: int, key: bytes, *, strict: bool = False) -> Node | None:
+    """The first node of a level whose last key is not before (strict: is after) this key."""
+    node = draft.inner(root.hash)
+    while True:
+        k = bisect_right(node.keys, key) if strict else bisect_left(node.keys, key)
+        if k == len(node.keys):
+            return None
+        if node.level == level + 1:
+            return node.child(k)
+        node = draft.inner(node.hashes[k])
+
+
+def _last(draft: Draft, root: Node, level: int) -> Node:
+    node = draft.inner(root.hash)
+    while node.level > level + 1:
+        node = draft.inner(node.hashes[-1])
+    return node.child(len(node.keys) - 1)
+
+
+def _before(draft: Draft, root: Node, level: int, key: bytes) -> Node | None:
+    """The last node of a level whose last key is before this key."""
+
+    def search(node: Inner) -> Node | None:
+        k = bisect_left(node.keys, key)
+        if node.level == level + 1:
+            return node.child(k - 1) if k else None
+        if k < len(node.keys):
+            found = search(draft.inner(node.hashes[k]))
+            if found:
+                return found
+        return _last(draft, node.child(k - 1), level) if k else None
+
+    return search(draft.inner(root.hash))
