@@ -7,9 +7,10 @@ UV_VERSION := 0.13.8
 BIN := $(VENV)/bin
 ARGS ?=
 
-# uv installs the lock file in seconds; where it is absent it is put into the virtual environment first.
+# uv installs the lock file in seconds; where it is absent it is put into the virtual environment first. The machine's
+# own certificates are trusted, as pip and curl do.
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo $(BIN)/uv)
-SYNC := UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen --inexact --quiet --no-python-downloads
+SYNC := UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen --inexact --quiet --no-python-downloads
 
 .PHONY: run test lint bench install install-dev clean
 
@@ -24,7 +25,7 @@ lint: install-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) lock --check --no-python-downloads
+	UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) lock --check --no-python-downloads
 
 bench: install-dev
 	@$(BIN)/python -m tests.bench $(ARGS)

@@ -225,7 +225,12 @@ class Client:
             pause = RETRY_SECONDS * 2 ** (TRIES - 1 - left)
             try:
                 answer = self._http.request(
-                    method, self._address(path), params=params or None, json=json, headers=headers, **(body() if body else {})
+                    method,
+                    self._address(path),
+                    params=params or None,
+                    json=json,
+                    headers=headers,
+                    **(body() if body else {}),
                 )
             except httpx.ConnectError as error:
                 raise _unreachable(self.server, error) from error

@@ -29,8 +29,9 @@ from app.errors import FleetMapError, Unavailable
 if TYPE_CHECKING:
     from app.config import Settings
 
-SECRETS_DIR = Path("/run/secrets")
-"""Where containers mount secrets: a file named like a setting (``fleetmap_admin_token``) holds its value."""
+SECRETS_DIR = "FLEETMAP_SECRETS_DIR"
+"""Names the folder where a container mounts secrets: a file named like a setting (``fleetmap_admin_token``) holds its
+value. It is no setting itself, since it says where settings are."""
 
 STOP_SECONDS = 20
 """How long requests that are being answered may take after SIGTERM."""
@@ -56,7 +57,8 @@ class Access:
 def serve(*, demo: bool = False, **values: Any) -> None:
     """Start the server in the foreground; it stops cleanly on SIGTERM and Ctrl-C.
 
-    Every option is also a setting: FLEETMAP_… in the environment or in a file .env, or a file /run/secrets/fleetmap_….
+    Every option is also a setting: FLEETMAP_… in the environment or in a file .env, or a file fleetmap_… in the folder
+    that FLEETMAP_SECRETS_DIR names.
     """
     settings = load_settings(values)
     listener = listen(settings.host, settings.port)
@@ -126,7 +128,11 @@ def load_settings(values: Mapping[str, Any]) -> Settings:
     from app.config import Settings
 
     given = {name: value for name, value in values.items() if value not in (None, False)}
-    given |= {"_secrets_dir": SECRETS_DIR} if SECRETS_DIR.is_dir() else {}
+    folder = os.environ.get(SECRETS_DIR)
+    if folder:
+        if not Path(folder).is_dir():
+            raise typer.BadParameter(f"{SECRETS_DIR}: there is no folder {folder}")
+        given["_secrets_dir"] = folder
     try:
         return Settings(**given)
     except ValidationError as error:

@@ -1,0 +1,199 @@
+"""Every command against a running server: what it does, what it prints, how it fails."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from app.cli import demo
+from tests.cli.conftest import TOKEN, Fleetmap
+
+NETWORK = """
+meta: {{last_updated: 2024-05-01_10-00-00}}
+metric_map: farm
+name: farm
+pointset: farm
+transformation:
+  child: topo_map
+  parent: map
+  rotation: {{w: 1.0, x: 0.0, y: 0.0, z: 0.0}}
+  translation: {{x: 0.0, y: 0.0, z: 0.0}}
+nodes:
+- meta: {{map: farm, node: A, pointset: farm}}
+  node:
+    name: A
+    parent_frame: map
+    pose: {{orientation: {{w: 1.0, x: 0.0, y: 0.0, z: 0.0}}, position: {{x: {x}, y: 0.0, z: 0.0}}}}
+    properties: {{xy_goal_tolerance: 0.3, yaw_goal_tolerance: 0.1}}
+    edges:
+    - {{action: move_base, edge_id: A_B, node: B, restrictions_planning: obstacleFree_1}}
+    verts: []
+- meta: {{map: farm, node: B, pointset: farm}}
+  node:
+    name: B
+    parent_frame: map
+    pose: {{orientation: {{w: 1.0, x: 0.0, y: 0.0, z: 0.0}}, position: {{x: 5.0, y: 2.0, z: 0.0}}}}
+    edges: []
+    verts: []
+"""
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Path:
+    path = tmp_path / "network.tmap2.yaml"
+    path.write_text(NETWORK.format(x="1.0"))
+    return path
+
+
+def history(fleetmap: Fleetmap, network: Path, name: str) -> None:
+    """An environment with versions 1 and 2; node A moves in the second."""
+    assert fleetmap("import", network, "-e", name, "-m", "first").status == 0
+    network.write_text(NETWORK.format(x="1.5"))
+    assert fleetmap("import", network, "-e", name, "-m", "moved A").status == 0
+
+
+def test_versions_diff_promote_and_revert(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+    history(fleetmap, network, "story")
+    rows = fleetmap("versions", "story", "--json").json
+    assert [(row["version"], row["message"]) for row in rows][:2] == [(2, "moved A"), (1, "first")]
+
+    told = fleetmap("diff", "story", "1", "2").out
+    assert "~ topology A: " in told
+    assert "B" not in {line.split()[2] for line in told.splitlines() if line.startswith("~ topology")}
+
+    assert fleetmap("promote", "story", "1").status == 0
+    assert "production" in fleetmap("versions", "story").out
+    out = tmp_path / "robot.yaml"
+    assert fleetmap("export", "story", "tmap2", "-o", out).status == 0
+    assert "x: 1.0" in out.read_text(), "robots get what production stands on"
+    assert fleetmap("export", "story", "tmap2", "-o", out, "--version", "latest").status == 0
+    assert "x: 1.5" in out.read_text()
+
+    assert fleetmap("revert", "story", "production").status == 0
+    roots = {row["version"]: row["root"] for row in fleetmap("versions", "story", "--json").json}
+    assert roots[3] == roots[1] != roots[2]
+    assert "hold the same" in fleetmap("diff", "story", "1", "3").out
+    assert len(fleetmap("versions", "story", "-n", "2", "--json").json) == 2
+
+
+def test_a_dry_run_stores_nothing(fleetmap: Fleetmap, network: Path) -> None:
+    refused = fleetmap("import", network, "-e", "rehearsal", "--dry-run")
+    assert refused.status == 1
+    assert "does not create it" in refused.err
+    assert fleetmap("import", network, "-e", "rehearsal").status == 0
+    network.write_text(NETWORK.format(x="9.0"))
+    told = fleetmap("import", network, "-e", "rehearsal", "--dry-run")
+    assert told.status == 0, told.err
+    assert "1 changed" in told.out
+    assert fleetmap("versions", "rehearsal", "--json").json[0]["version"] == 1
+
+
+def test_a_damaged_file_is_refused_with_its_place(fleetmap: Fleetmap, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.tmap2.yaml"
+    bad.write_text("meta: {}\nnodes:\n- node: {name: A\n")
+    told = fleetmap("import", bad, "-e", "damaged", "-f", "tmap2")
+    assert told.status == 1
+    assert "bad.tmap2.yaml:" in told.err
+    assert "Traceback" not in told.err
+    problem = json.loads(fleetmap("import", bad, "-e", "damaged", "-f", "tmap2", "--json").err)
+    assert problem["status"] == 422
+    assert problem["errors"][0]["file"] == "bad.tmap2.yaml"
+    assert all(row["version"] == 0 for row in fleetmap("versions", "damaged", "--json").json)
+
+
+def test_the_same_problem_without_a_server(offline: Fleetmap, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.tmap2.yaml"
+    bad.write_text("meta: {}\nnodes:\n- node: {name: A\n")
+    told = offline("convert", bad, "--format", "tmap2", "--to", "geojson", "-o", tmp_path / "out.geojson")
+    assert told.status == 1
+    assert "bad.tmap2.yaml:" in told.err
+    assert not (tmp_path / "out.geojson").exists()
+
+
+def test_a_new_environment_takes_its_datum(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+    assert fleetmap("import", network, "-e", "placed", "--datum", "52.5,5.5,30").status == 0
+    out = tmp_path / "datum.yaml"
+    assert fleetmap("export", "placed", "datum", "-o", out).status == 0
+    assert "52.5" in out.read_text()
+    told = fleetmap("import", network, "-e", "placed", "--datum", "91,0")
+    assert told.status == 1
+    assert "latitude" in told.err
+
+
+def test_coverage_and_formats(fleetmap: Fleetmap, network: Path) -> None:
+    assert fleetmap("import", network, "-e", "covered").status == 0
+    rows = {row["format"]: row["state"] for row in fleetmap("coverage", "covered", "--json").json}
+    assert rows["tmap2"] == "direct"
+    assert rows["occupancy_grid"] == "missing"
+    told = fleetmap("coverage", "covered").out
+    assert "tmap2" in told
+    known = {f["id"]: f for f in fleetmap("formats", "--json").json}
+    assert {"datum", "geojson", "kml", "kmz", "occupancy_grid", "osm", "tmap2"} <= set(known)
+    assert "resolution" in {o["name"] for o in known["occupancy_grid"]["write_options"]}
+
+
+def test_tokens(fleetmap: Fleetmap, network: Path) -> None:
+    assert fleetmap("import", network, "-e", "guarded").status == 0
+    made = fleetmap("token", "create", "field robot", "--role", "viewer", "--environments", "guard*", "--json").json
+    assert fleetmap("versions", "guarded", "--token", made["token"]).status == 0
+    denied = fleetmap("revert", "guarded", "1", "--token", made["token"])
+    assert denied.status == 1
+    assert "error:" in denied.err
+    listed = fleetmap("token", "list", "--json")
+    assert made["id"] in {row["id"] for row in listed.json}
+    assert made["token"] not in listed.out
+    assert fleetmap("token", "delete", made["id"]).status == 0
+    gone = fleetmap("versions", "guarded", "--token", made["token"])
+    assert gone.status == 1
+    assert "--token" in gone.err
+
+
+def test_usage_errors_have_their_own_status(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+    assert fleetmap("import", network).status == 2
+    assert fleetmap("export", "story", "kml", "-o", "-", "--json").status == 2
+    assert fleetmap("nonsense").status == 2
+    assert fleetmap("import", tmp_path / "absent", "-e", "x").status == 1
+    assert "absent does not exist" in fleetmap("import", tmp_path / "absent", "-e", "x").err
+    assert fleetmap("versions", "no-such-place").status == 1
+
+
+def test_an_option_that_nobody_knows_is_refused(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+    assert fleetmap("import", network, "-e", "opted").status == 0
+    for told in (
+        fleetmap("export", "opted", "tmap2", "-o", tmp_path / "x", "-O", "colour=red"),
+        fleetmap("convert", network, "--to", "tmap2", "-o", tmp_path / "x", "-O", "colour=red"),
+        fleetmap("import", network, "-e", "opted", "-O", "colour=red"),
+    ):
+        assert told.status == 1
+        assert "colour" in told.err
+    assert not (tmp_path / "x").exists()
+
+
+def test_the_demo_comes_once_and_its_commands_work(fleetmap: Fleetmap, server: str, tmp_path: Path) -> None:
+    first = fleetmap("demo", "--json").json
+    assert first == {"environment": demo.NAME, "version": 1, "created": True}
+    assert fleetmap("demo", "--json").json == {**first, "created": False}
+    version = fleetmap("versions", demo.NAME, "--json").json[0]
+    assert version["warnings"] == []
+    held = {layer for layer, kind in version["information"].items() if kind != "missing"}
+    assert held == {"location", "objects", "topology", "occupancy", "zones"}
+    assert len(demo.curl_lines(server, TOKEN)) == 3
+    for line in demo.curl_lines(server, TOKEN):
+        done = subprocess.run(
+            [*shlex.split(line), "--fail", "--silent", "--show-error"],
+            cwd=tmp_path,
+            capture_output=True,
+            timeout=60,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr.decode()
+    assert demo.NAME in {e["name"] for e in json.loads(run_curl(demo.curl_lines(server, TOKEN)[0]))["items"]}
+    assert (tmp_path / f"{demo.NAME}.kml").read_bytes().startswith(b"<?xml")
+
+
+def run_curl(line: str) -> bytes:
+    return subprocess.run([*shlex.split(line), "--silent"], capture_output=True, timeout=60, check=True).stdout

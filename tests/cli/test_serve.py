@@ -1,0 +1,139 @@
+"""Starting and stopping the server as users, containers and `make run` do."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from app.cli.serving import wait_ready
+from tests.cli.conftest import Fleetmap, ServerProcess
+
+
+def start(folder: Path, *arguments: str, **environment: str) -> ServerProcess:
+    return ServerProcess("--data-dir", str(folder / "data"), *arguments, environment=environment, folder=folder)
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_first_start_prints_a_token_once_and_sigterm_stops_it_cleanly(
+    workers: str, tmp_path: Path, offline: Fleetmap
+) -> None:
+    process = start(tmp_path, "--workers", workers)
+    try:
+        wait_ready(process.address)
+        token = process.wait_for(r"administrator's token, shown only this once: (\S+)")[1]
+        listed = offline("token", "list", "--server", process.address, "--token", token, "--json")
+        assert [row["role"] for row in listed.json] == ["admin"]
+    finally:
+        assert process.stop(signal.SIGTERM) == 0
+    again = start(tmp_path, "--workers", workers)
+    try:
+        wait_ready(again.address)
+        assert offline("token", "list", "--server", again.address, "--token", token).status == 0
+        assert not any("shown only this once" in line for line in again.lines)
+        assert not any(token in line for line in again.lines)
+    finally:
+        assert again.stop(signal.SIGINT) == 0
+
+
+def test_a_given_token_is_used_and_never_printed(tmp_path: Path, offline: Fleetmap) -> None:
+    process = start(tmp_path, FLEETMAP_ADMIN_TOKEN="given-by-the-operator")
+    try:
+        wait_ready(process.address)
+        told = offline("token", "list", "--server", process.address, "--token", "given-by-the-operator")
+        assert told.status == 0
+        assert "given-by-the-operator" not in told.out
+    finally:
+        process.stop()
+    assert not any("given-by-the-operator" in line for line in process.lines)
+
+
+def test_a_mounted_secret_is_a_setting(tmp_path: Path, offline: Fleetmap) -> None:
+    (tmp_path / "secrets").mkdir()
+    (tmp_path / "secrets" / "fleetmap_admin_token").write_text("mounted-as-a-secret\n")
+    process = start(tmp_path, FLEETMAP_SECRETS_DIR=str(tmp_path / "secrets"))
+    try:
+        wait_ready(process.address)
+        assert offline("token", "list", "--server", process.address, "--token", "mounted-as-a-secret").status == 0
+    finally:
+        process.stop()
+
+
+def test_the_demo_prints_commands_that_work_at_every_start(tmp_path: Path) -> None:
+    for _ in range(2):
+        process = start(tmp_path, "--demo")
+        try:
+            token = process.wait_for(r"^administrator's token: (\S+)")[1]
+            line = process.wait_for(r"^  curl .*/tmap2")[0]
+            assert token in line
+            address = line.split('"')[-2]
+            request = urllib.request.Request(address, headers={"Authorization": f"Bearer {token}"})
+            with urllib.request.urlopen(request, timeout=30) as answer:
+                assert b"Dock" in answer.read()
+        finally:
+            assert process.stop() == 0
+    assert (tmp_path / "data" / "demo-token").stat().st_mode & 0o077 == 0
+
+
+def test_a_taken_port_is_said_in_one_line(tmp_path: Path, offline: Fleetmap) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        told = offline("serve", "--port", str(port), "--data-dir", tmp_path / "data")
+    assert told.status == 1
+    assert f"cannot listen on 127.0.0.1 port {port}" in told.err
+    assert "--port" in told.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--port", "99999"], "FLEETMAP_PORT"),
+        (["--workers", "none"], "FLEETMAP_WORKERS"),
+        (["--insecure-no-auth", "--host", "0.0.0.0"], "loopback"),
+        (["--no-such-flag"], "--no-such-flag"),
+    ],
+)
+def test_unusable_settings_are_usage_errors(
+    arguments: list[str], named: str, offline: Fleetmap, tmp_path: Path
+) -> None:
+    told = offline("serve", "--data-dir", tmp_path / "data", *arguments)
+    assert told.status == 2
+    assert named in " ".join(told.err.split())
+
+
+def test_every_setting_is_a_flag_but_secrets(offline: Fleetmap, monkeypatch: pytest.MonkeyPatch) -> None:
+    from app.config import Settings
+
+    monkeypatch.setenv("COLUMNS", "200")
+    told = offline("serve", "--help").out
+    for name in Settings.model_fields:
+        assert (f"--{name.replace('_', '-')} " in told) == (name != "admin_token"), name
+
+
+def test_workers_end_with_the_process_that_started_them(tmp_path: Path) -> None:
+    process = start(tmp_path, "--workers", "2")
+    address = process.address
+    wait_ready(address)
+    process.process.kill()
+    process.process.wait(10)
+    process._reader.join(30)  # its output ends when the last worker has closed it
+    ended = not process._reader.is_alive()
+    process.stop()
+    assert ended
+    port = int(address.rpartition(":")[2])
+    with socket.create_server(("127.0.0.1", port)):
+        pass
+
+
+def test_migrate_brings_a_database_up_and_hides_its_password(offline: Fleetmap, tmp_path: Path) -> None:
+    told = offline("migrate", "--data-dir", tmp_path / "data", "--json")
+    assert told.status == 0, told.err
+    assert told.json["migrated"] is True
+    assert (tmp_path / "data" / "fleetmap.sqlite3").is_file()
+    assert offline("migrate", "--data-dir", tmp_path / "data").status == 0
+    told = offline("migrate", "--database-url", "postgresql+psycopg://me:hidden-word@127.0.0.1:1/none")
+    assert told.status == 1
+    assert "hidden-word" not in told.err + told.out
