@@ -73,9 +73,9 @@ RESERVED = OWN_WORDS | {
 COORDINATES, NAME, END = "<?c?>", "<?n?>", "<?end?>"
 SLOT = re.compile(r"<\?(c|n|d ([^?]*))\?>")
 
-# Marks that stand for slots while libxml2 holds the tree (it takes no control characters). Private characters of the
-# last plane; a file that uses them itself is refused, since its slots could not be told apart.
-_M_ITEM, _M_COORDINATES, _M_NAME, _M_DATA, _M_END = (chr(0x10FF00 + k) for k in range(5))
+# Marks that stand for slots while libxml2 holds the tree: four C1 controls in a row, which no text has, not even UTF-8
+# misread as Latin-1 (and such characters keep a Python text at one byte a character). A file that has them is refused.
+_M_ITEM, _M_COORDINATES, _M_NAME, _M_DATA, _M_END = ("\x91\x9c\x82" + chr(0x86 + k) for k in range(5))
 
 _NUMBER_BYTES = np.zeros(256, bool)
 _NUMBER_BYTES[list(b"0123456789+-.eE")] = True
@@ -95,8 +95,7 @@ def local_name(element: etree._Element) -> str:
 
 def child(element: etree._Element, name: str) -> etree._Element | None:
     """The first child of this name, in any namespace: KML is found in five of them, and without one."""
-    found: etree._Element | None = element.find("{*}" + name)
-    return found
+    return next(element.iterchildren("{*}" + name), None)
 
 
 def child_text(element: etree._Element, name: str) -> str:
@@ -149,10 +148,11 @@ def parse_coordinates(texts: Sequence[str]) -> Sequences:
     except ValueError:
         return _one_by_one(texts)
     points = np.zeros((len(begins), 3))
-    first = np.concatenate([[0], np.cumsum(size)[:-1]]).astype(np.int64)
-    points[:, 0], points[:, 1] = values[first], values[first + 1]
-    deep = size == 3
-    points[deep, 2] = values[first[deep] + 2]
+    if len(begins):
+        first = np.concatenate([[0], np.cumsum(size)[:-1]]).astype(np.int64)
+        points[:, 0], points[:, 1] = values[first], values[first + 1]
+        deep = size == 3
+        points[deep, 2] = values[first[deep] + 2]
     start = np.searchsorted(text_of, np.arange(len(texts) + 1))
     return Sequences(points, start, odd)
 
@@ -217,14 +217,15 @@ def _line(points: Sequence[tuple[float, float, float]]) -> Any:
 
 
 def _area(rings: Sequence[Sequence[tuple[float, float, float]]]) -> Any:
-    """A polygon from its rings, closed if they are open; an outer ring without area is a line or a point."""
-    if not rings:
+    """A polygon from its rings, closed if they are open. A ring of too few points (edges are drawn so: there and back)
+    is filled up with a point it has: an area of nothing, but still what was drawn.
+    """
+    if not rings or not rings[0]:
         return NO_GEOMETRY
-    closed = [[*r, r[0]] if r and r[0] != r[-1] else list(r) for r in rings]
-    if len(closed[0]) < 4:
-        return _line(rings[0])
+    closed = [[*r, r[0]] if r[0] != r[-1] else list(r) for r in rings if r]
+    closed = [r if len(r) >= 4 else [*r[:-1], *[r[-2 if len(r) > 1 else 0]] * (4 - len(r)), r[-1]] for r in closed]
     deep = any(p[2] for r in closed for p in r)
-    make = [shapely.linearrings(np.array(r)[:, : 3 if deep else 2]) for r in closed if len(r) >= 4]
+    make = [shapely.linearrings(np.array(r)[:, : 3 if deep else 2]) for r in closed]
     return shapely.polygons(make[0], holes=make[1:] or None)
 
 
@@ -399,9 +400,9 @@ class _Item:
     """A placemark or overlay while its tree is read."""
 
     element: etree._Element
-    data: list[tuple[str, etree._Element]] = field(default_factory=list)
-    geometries: list[etree._Element] = field(default_factory=list)
-    sequences: list[tuple[str, int]] = field(default_factory=list)
+    data: tuple[tuple[str, etree._Element], ...] = ()
+    geometries: tuple[etree._Element, ...] = ()
+    sequences: tuple[tuple[str, int, etree._Element], ...] = ()
     shape: str = ""
 
 
@@ -610,7 +611,7 @@ class _Reader:
                 continue
             item.shape = found[0]
             for role, c in found[1]:
-                item.sequences.append((role, len(texts)))
+                item.sequences += ((role, len(texts), c),)
                 texts.append(c.text or "")
         if not texts:
             return Sequences(np.empty((0, 3)), np.zeros(1, np.int64), np.zeros(0, bool))
@@ -624,7 +625,7 @@ class _Reader:
         counts, odd, closes = count.tolist(), parsed.odd.tolist(), closed.tolist()
         strange = []
         for item in items:
-            for role, k in item.sequences:
+            for role, k, _ in item.sequences:
                 n = counts[k]
                 if odd[k] or n < least[role] or (role == "P" and n > 1) or (role == "R" and not closes[k]):
                     item.shape = ""
@@ -657,7 +658,7 @@ class _Reader:
         for k, item in enumerate(items):
             element = item.element
             title = titles[k]
-            own: dict[str, Any] = {"kind": _KINDS[types[k]] if local_name(element) not in OVERLAYS else "overlay"}
+            own: dict[str, Any] = {"kind": "overlay" if local_name(element) in OVERLAYS else _KINDS[types[k]]}
             kept: dict[str, Any] = {"document": name, "place": k}
             if title is not None:
                 tag, text = title
@@ -672,25 +673,28 @@ class _Reader:
                 values += 1
             if item.shape:
                 kept["shape"] = item.shape
-                for c in item.geometries[0].iter("{*}coordinates"):
+                for _, _, c in item.sequences:
                     c.text = _M_COORDINATES
-                    coordinates += 1
+                coordinates += len(item.sequences)
             own["kml"] = kept
             properties.append(own)
-        text = _serialised(root, [item.element for item in items])
-        found = [text.count(m) for m in (_M_NAME, _M_DATA, _M_COORDINATES, _M_END)]
-        pieces = text.split(_M_ITEM)
-        if found[:3] != [names, 2 * values, coordinates] or found[3] > 1 or len(pieces) != 2 * len(items) + 1:
-            reason = "the file uses private characters U+10FF00 to U+10FF04, which cannot be told from our own marks"
+        text, begins = _serialised(root, [item.element for item in items])
+        found = [text.count(m) for m in (_M_NAME, _M_DATA, _M_COORDINATES)]
+        runs = text.count(_M_ITEM) - len(items)
+        if found != [names, 2 * values, coordinates] or runs != sum(begins) or text.count(_M_END) > 1:
+            reason = "the file has runs of control characters (U+0091 U+009C U+0082 …) that serve as marks here"
             raise UnreadableFile(reason, [Problem(reason)])
-        for own, piece in zip(properties, pieces[1::2], strict=True):
-            own["kml"]["xml"] = _slots(piece, values)
+        text = text.replace(_M_NAME, NAME).replace(_M_COORDINATES, COORDINATES).replace(_M_END, END)
+        if values:
+            text = re.sub(f"{_M_DATA}([^\x91]*){_M_DATA}", r"<?d \1?>", text)
+        pieces = iter(text.split(_M_ITEM))
         skeleton = []
-        for k, piece in enumerate(pieces[0::2]):
-            skeleton.append(piece)
-            if k < len(items) and (piece or k == 0):
-                skeleton.append(f"<?items {k}?>")
-        document: dict[str, Any] = {"xml": "".join(skeleton).replace(_M_END, END)}
+        for k, (own, first) in enumerate(zip(properties, begins, strict=True)):
+            if first:
+                skeleton += [next(pieces), f"<?items {k}?>"]
+            own[FAMILY]["xml"] = next(pieces)
+        skeleton += pieces
+        document: dict[str, Any] = {"xml": "".join(skeleton)}
         if entry is not None:
             document["entry"] = entry
         self.documents.setdefault(level, {})[name] = document
@@ -775,7 +779,7 @@ def _check_places(items: Sequence[_Item], parsed: Sequences) -> None:
         return
     at = int(np.flatnonzero(~good)[0])
     sequence = int(np.searchsorted(parsed.start, at, "right")) - 1
-    owner = next((i for i in items if any(k == sequence for _, k in i.sequences)), None)
+    owner = next((i for i in items if any(k == sequence for _, k, _ in i.sequences)), None)
     x, y, _ = points[at]
     line = None if owner is None else owner.geometries[0].sourceline
     raise UnreadableFile(f"the coordinates {x:g},{y:g} are not on earth", [_off_earth(x, y, line)])
@@ -803,18 +807,18 @@ def _items(root: etree._Element) -> list[_Item]:
     index: dict[etree._Element, _Item] = {}
     for element in root.iter(*(f"{{*}}{name}" for name in sorted(ITEMS))):
         parent = element.getparent()
-        if parent is None or contained(parent):
+        if parent is None or good.get(parent) or contained(parent):
             item = _Item(element)
             items.append(item)
             index[element] = item
     for g in root.iter(*(f"{{*}}{name}" for name in sorted(GEOMETRIES))):
         owner = index.get(g.getparent())
         if owner is not None:
-            owner.geometries.append(g)
+            owner.geometries += (g,)
     for extended in root.iter("{*}ExtendedData"):
         owner = index.get(extended.getparent())
         if owner is not None:
-            owner.data += _values(extended)
+            owner.data += tuple(_values(extended))
     return items
 
 
@@ -839,16 +843,22 @@ def _plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Ele
     """
     name = local_name(g)
     if name == "Polygon":
+        if len(g) == 1 and (c := _only_ring(g[0])) is not None:
+            return "A1", [("R", c)]
         found = list(g.iter("{*}coordinates"))
         for k, c in enumerate(found):
             ring = c.getparent()
             side = ring.getparent()
             word = "outerBoundaryIs" if k == 0 else "innerBoundaryIs"
-            if len(c) or local_name(side) != word or side.getparent() is not g or len(ring.findall(c.tag)) != 1:
+            alone = len(list(ring.iterchildren(c.tag))) == 1 and not len(c)
+            if not alone or local_name(side) != word or side.getparent() is not g:
                 return None
         return (f"A{len(found)}", [("R", c) for c in found]) if found else None
     if name in SIMPLE:
-        found = g.findall("{*}coordinates")
+        if len(g) == 1 and not len(g[0]) and g[0].tag.endswith("}coordinates"):
+            role = "P" if name == "Point" else "L"
+            return role, [(role, g[0])]
+        found = list(g.iterchildren("{*}coordinates"))
         if len(found) != 1 or len(found[0]) or len(list(g.iter("{*}coordinates"))) != 1:
             return None
         role = "P" if name == "Point" else "L"
@@ -863,6 +873,16 @@ def _plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Ele
         shape += inner[0]
         out += inner[1]
     return (shape, out) if out else None
+
+
+def _only_ring(side: etree._Element) -> etree._Element | None:
+    """The coordinates of ``<outerBoundaryIs><LinearRing><coordinates/>`` with nothing else in it, as nearly all are."""
+    if len(side) == 1 and local_name(side) == "outerBoundaryIs":
+        ring = side[0]
+        if len(ring) == 1 and not len(ring[0]) and local_name(ring) == "LinearRing":
+            c = ring[0]
+            return c if local_name(c) == "coordinates" else None
+    return None
 
 
 def _geometries(items: Sequence[_Item], parsed: Sequences) -> NDArray[np.object_]:
@@ -904,7 +924,7 @@ def _geometries(items: Sequence[_Item], parsed: Sequences) -> NDArray[np.object_
 
 def _assembled(item: _Item, parsed: Sequences) -> Any:
     """A plain geometry of several lists: an area with holes, or a collection."""
-    lists = [parsed.points[parsed.start[k] : parsed.start[k + 1]] for _, k in item.sequences]
+    lists = [parsed.points[parsed.start[k] : parsed.start[k + 1]] for _, k, _ in item.sequences]
     deep = any(p[:, 2].any() for p in lists)
     rows = iter([p if deep else p[:, :2] for p in lists])
     shapes = []
@@ -921,6 +941,8 @@ def _assembled(item: _Item, parsed: Sequences) -> Any:
 
 def _usable(text: str) -> str:
     """A text as an id: printable and not too long."""
+    if text.isprintable() and 0 < len(text) <= MAX_ID - 12 and text[0] != " " != text[-1]:
+        return text
     clean = "".join(c if c.isprintable() else " " for c in text).strip()
     return clean[: MAX_ID - 12] or "_"
 
@@ -951,8 +973,10 @@ def _identify(
     return ids, titles
 
 
-def _serialised(root: etree._Element, items: Sequence[etree._Element]) -> str:
-    """The tree as text, with a mark before and behind each item, and one where more can be added."""
+def _serialised(root: etree._Element, items: Sequence[etree._Element]) -> tuple[str, list[bool]]:
+    """The tree as text with a mark behind each item, before each that follows no other item directly (True in the
+    list), and where more can be added.
+    """
     top = [c for c in root if local_name(c) in CONTAINERS | ITEMS]
     if local_name(root) == "kml" and len(top) == 1 and local_name(top[0]) in CONTAINERS:
         last = top[0][-1] if len(top[0]) else None
@@ -960,21 +984,24 @@ def _serialised(root: etree._Element, items: Sequence[etree._Element]) -> str:
             top[0].text = (top[0].text or "") + _M_END
         else:
             last.tail = (last.tail or "") + _M_END
+    begins = []
+    previous = None
     for element in items:
-        before, parent = element.getprevious(), element.getparent()
-        if before is not None:
+        before = element.getprevious()
+        first = before is None or before is not previous
+        if before is None:
+            parent = element.getparent()
+            if parent is not None:
+                parent.text = (parent.text or "") + _M_ITEM
+        elif first:
             before.tail = (before.tail or "") + _M_ITEM
-        elif parent is not None:
-            parent.text = (parent.text or "") + _M_ITEM
-        if parent is not None:
-            element.tail = _M_ITEM + (element.tail or "")
+        tail = element.tail
+        if element is not root:
+            element.tail = _M_ITEM + tail if tail else _M_ITEM
+        begins.append(first)
+        previous = None if tail else element
     text: str = etree.tostring(root, encoding="unicode")
-    return f"{_M_ITEM}{text}{_M_ITEM}" if items and items[0] is root else text
-
-
-def _slots(xml: str, values: int) -> str:
-    xml = xml.replace(_M_NAME, NAME).replace(_M_COORDINATES, COORDINATES)
-    return re.sub(f"{_M_DATA}([^{_M_DATA}]*){_M_DATA}", r"<?d \1?>", xml) if values and _M_DATA in xml else xml
+    return (f"{_M_ITEM}{text}{_M_ITEM}" if items and items[0] is root else text), begins
 
 
 def _metres(texts: Sequence[str | None], elements: Sequence[etree._Element]) -> list[Any]:

@@ -35,7 +35,7 @@ def parse(
     root = etree.fromstring(data.lstrip(b"\xef\xbb\xbf \t\r\n"), parser)
     if root.getroottree().docinfo.internalDTD is not None:
         raise UnreadableFile("a DOCTYPE is not accepted: remove it", [Problem("DOCTYPE is not accepted", line=1)])
-    check_bounds(root, limits)
+    check_bounds(root, limits, None if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in data[:4] else data)
     return root
 
 
@@ -54,8 +54,24 @@ def check_prolog(data: bytes) -> None:
         raise UnreadableFile(reason, [Problem(reason, line=line)])
 
 
-def check_bounds(root: etree._Element, limits: Limits) -> None:
-    """Refuse attributes longer than a real map's; libxml2 itself stops at depth 256 and texts of 10 MB."""
+def check_bounds(root: etree._Element, limits: Limits, data: bytes | None = None) -> None:
+    """Refuse attributes longer than a real map's; libxml2 itself stops at depth 256 and texts of 10 MB.
+
+    data: the bytes that the tree was read from, where they are at hand: without a long quoted run in them there is no
+    long attribute to look for.
+    """
+    if data is not None and not _long_quote(data, limits.xml_attribute_bytes):
+        return
     for long in root.xpath("//@*[string-length() > $most]", most=limits.xml_attribute_bytes):
         reason = f"an attribute is longer than {limits.xml_attribute_bytes} characters"
         raise UnreadableFile(reason, [Problem(reason, line=long.getparent().sourceline, where=long.attrname)])
+
+
+def _long_quote(data: bytes, most: int) -> bool:
+    """Whether an attribute value of more than this many bytes may stand in it (``=``, a quote, no such quote for long).
+
+    An entity or a longer encoding makes the bytes more than the characters, never fewer.
+    """
+    if len(data) <= most:
+        return False
+    return re.search(rb"""=\s*(?:"[^"]{%d}|'[^']{%d})""" % (most, most), data) is not None
