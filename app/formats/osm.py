@@ -1,0 +1,1096 @@
+"""OpenStreetMap: XML (``.osm``, also ``.gz`` and ``.bz2``) and PBF in, XML out.
+
+Reading. Each node that a ``highway=*`` way uses is a topology node ``n<id>``, each segment of such a way a directed
+edge ``w<way>:<from>-<to>`` (a segment that the way repeats gets ``#2`` …), two where it may be used both ways. Tags and
+the further attributes (version, user, timestamp …) stay with nodes and edges in ``properties.osm``. Everything else is
+an object of the family ``osm``: tagged or lone nodes ``n<id>``, all ways ``w<id>`` (the highways too, so that they come
+back whole and in order) and relations ``r<id>``. Nodes that only bend a line are no objects: their ids and attributes
+stand with their way, in ``refs`` and ``vertices``, and their places in its geometry. ``properties.osm`` of an object:
+
+========== ============================================================================================================
+tags       key -> value
+attributes XML attributes but for id, lat and lon
+refs       (ways) node ids in order
+missing    (ways) indexes into refs of nodes without a place; the geometry has a vertex for each of the others
+vertices   (ways) attributes of the nodes that are no features: one mapping for all, or a list parallel to refs
+members    (relations) [type, id, role] in order
+children   elements that OSM does not know: [name, attributes]
+========== ============================================================================================================
+
+An object's kind is its main tag's key (``building``, ``natural``, ``highway`` …), else ``point``, ``line`` or
+``relation``. Elements marked as deleted (``action="delete"``, ``visible="false"``) are kept, but
+no robot drives on them.
+
+Writing. The canonical content decides: a feature's place wins over what else is known of a node; a highway way comes
+back whole while all its edges are in the network, and is split where edges are gone, have become one-way or carry other
+tags (the first piece keeps the id, the others get negative ones, and relations follow). Edges that no way explains
+become new ways with negative ids. Objects of other formats, and zones, are written as ways and nodes with the tags
+``name`` and ``kind``. Sorted as the OSM tools ask: nodes, ways, relations, each by id.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from itertools import chain, pairwise
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import Problem, UnreadableFile
+from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext, register
+from app.formats._osm import INT64, Attributes, Data, Tags, Way, is_pbf, parse, unpack
+from app.formats._text import DEGREES, numbers
+from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, points, segments
+from app.model.frame import GROUND
+from app.model.layers import NETWORK, Layers, Part, PartKey
+
+FAMILY = "osm"
+GENERATOR = "Fleet Map Server"
+
+MAIN_TAGS = (
+    "highway",
+    "building",
+    "building:part",
+    "barrier",
+    "railway",
+    "waterway",
+    "aeroway",
+    "aerialway",
+    "power",
+    "man_made",
+    "amenity",
+    "shop",
+    "office",
+    "craft",
+    "emergency",
+    "leisure",
+    "tourism",
+    "historic",
+    "public_transport",
+    "natural",
+    "landuse",
+    "military",
+    "place",
+    "boundary",
+    "route",
+)
+"""The keys that say what an element is, most telling first (OSM wiki: Map features)."""
+
+AREAS = frozenset(
+    {
+        "building",
+        "building:part",
+        "amenity",
+        "shop",
+        "office",
+        "craft",
+        "leisure",
+        "tourism",
+        "historic",
+        "natural",
+        "landuse",
+        "military",
+        "place",
+        "boundary",
+    }
+)
+"""A closed way with one of these is an area (OSM wiki: Area), unless it says ``area=no``."""
+
+LINES = frozenset({"coastline", "cliff", "tree_row", "ridge", "arete", "valley", "track", "slipway", "citywalls"})
+"""Values of such keys that are lines all the same."""
+
+Direction = Literal["both", "forward", "backward"]
+
+_FORWARD = frozenset({"yes", "true", "1", "reversible", "alternating"})
+_BACKWARD = frozenset({"-1", "reverse"})
+_NO = frozenset({"no", "false", "0"})
+
+
+def direction(tags: Mapping[str, Any]) -> Direction:
+    """Which way along its nodes a way may be used.
+
+    ``oneway`` decides. Without it roundabouts and motorways are one-way, their links too: to drive against a link's
+    traffic is worse than not to drive there. A reversible way is taken as it was drawn, never in both directions.
+    """
+    said = str(tags.get("oneway", "")).strip().lower()
+    if said in _FORWARD:
+        return "forward"
+    if said in _BACKWARD:
+        return "backward"
+    if said in _NO:
+        return "both"
+    implied = tags.get("junction") in ("roundabout", "circular") or tags.get("highway") in ("motorway", "motorway_link")
+    return "forward" if implied else "both"
+
+
+def deleted(attributes: Mapping[str, Any]) -> bool:
+    """Whether an element is only there to say that it is gone."""
+    return attributes.get("action") == "delete" or attributes.get("visible") == "false"
+
+
+def kind_of(tags: Mapping[str, Any], otherwise: str) -> str:
+    """The key of the main tag."""
+    found = next((key for key in MAIN_TAGS if key in tags and tags[key] != "no"), None)
+    if found is None:
+        return str(tags["type"]) if otherwise == "relation" and tags.get("type") else otherwise
+    return "building" if found == "building:part" else found
+
+
+def is_area(tags: Mapping[str, Any]) -> bool:
+    """Whether a closed way encloses something rather than going around it."""
+    if "area" in tags:
+        return bool(tags["area"] != "no")
+    return any(k in AREAS and tags[k] not in LINES and tags[k] != "no" for k in tags) and "barrier" not in tags
+
+
+@dataclass(slots=True)
+class Edges:
+    """The directed edges of one way: parallel lists. segment: index of the first of the two refs."""
+
+    segment: list[int] = field(default_factory=list)
+    ids: list[str] = field(default_factory=list)
+    source: list[int] = field(default_factory=list)
+    target: list[int] = field(default_factory=list)
+
+
+def way_edges(way: int, refs: Sequence[int], tags: Mapping[str, Any], absent: Set[int]) -> Edges:
+    """The edges that a way means: reader and writer must agree on them, ids included. absent: nodes without a place."""
+    out = Edges()
+    seen: dict[str, int] = {}
+    which = direction(tags)
+    forward, backward = which != "backward", which != "forward"
+    for k, (a, b) in enumerate(pairwise(refs)):
+        if a == b or (absent and (a in absent or b in absent)):
+            continue
+        for wanted, p, q in ((forward, a, b), (backward, b, a)):
+            if wanted:
+                name = f"w{way}:{p}-{q}"
+                times = seen[name] = seen.get(name, 0) + 1
+                out.segment.append(k)
+                out.ids.append(name if times == 1 else f"{name}#{times}")
+                out.source.append(p)
+                out.target.append(q)
+    return out
+
+
+# --- reading -----------------------------------------------------------------------------------------------------
+
+
+def detect(name: str, data: bytes) -> bool:  # noqa: ARG001
+    """By content: an ``<osm>`` root (also compressed), or a PBF header."""
+    head = unpack(data[: 2**16], Limits(), most=4096)[:4096] if data[:3] in (b"BZh", *_GZIP) else data[:4096]
+    if is_pbf(head):
+        return True
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        head = head.decode("utf-16", "replace").encode()
+    first = re.search(rb"<([A-Za-z_][\w:.-]*)", re.sub(rb"(?s)<!--.*?-->", b"", head))
+    return bool(first) and first[1] == b"osm" if first else False
+
+
+_GZIP = tuple(b"\x1f\x8b" + bytes([k]) for k in (8,))
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """A highway network and all other elements as objects, on earth.
+
+    Raises UnreadableFile, with a line where there is one, for what is no OSM file and for places that are not on earth.
+    """
+    topology, objects = context.wants("topology"), context.wants("objects")
+    data = parse(files[context.main], context.limits, highways_only=not objects)
+    for problem, line, where in data.problems:
+        context.warn(problem, line=line, where=where)
+    _check_version(data, context)
+    document = _document(data)
+    network = _Network(data, context)
+    parts: dict[PartKey, Part] = {}
+    if topology:
+        made = network.features(document)
+        if len(made):
+            parts[PartKey("topology", context.level, NETWORK)] = made
+    if objects:
+        parts[PartKey("objects", context.level, FAMILY)] = _objects(data, network, context, document)
+    elif not parts:
+        nothing = from_columns((), np.empty(0, object), (), "wgs84", document)
+        parts[PartKey("objects", context.level, FAMILY)] = nothing
+    return Layers(parts)
+
+
+def _check_version(data: Data, context: ReadContext) -> None:
+    version = data.root.get("version")
+    if version is None:
+        if not any(name == "MetaInfo" for name, _, _ in data.elements):
+            reason = 'the <osm> element needs a version: version="0.6"'
+            raise UnreadableFile(reason, [Problem(reason, line=1, where="<osm>")])
+        context.warn('the <osm> element has no version; read as "0.6"', where="<osm>")
+    elif version != "0.6":
+        context.warn(f"OSM version {version} is read as 0.6", where="<osm>")
+
+
+def _document(data: Data) -> dict[str, Any]:
+    said: dict[str, Any] = {"attributes": data.root}
+    if data.bounds:
+        said["bounds"] = data.bounds
+    if data.elements:
+        said["elements"] = [[name, attributes, text] for name, attributes, text in data.elements]
+    document: dict[str, Any] = {"osm": said}
+    boxes = [box for box in map(_box, data.bounds) if box is not None]
+    if boxes:
+        west, south, east, north = zip(*boxes, strict=True)
+        document["bounds"] = [min(west), min(south), max(east), max(north)]
+    texts = [data.root[k] for k in ("copyright", "attribution", "license") if data.root.get(k)]
+    texts += [text for name, _, text in data.elements if name == "note" and text]
+    if texts:
+        document["attribution"] = texts
+    return document
+
+
+def _box(attributes: Attributes) -> tuple[float, float, float, float] | None:
+    """[west, south, east, north] of a ``<bounds>``, or of the older ``<bound box="s,w,n,e">``."""
+    names = ("minlon", "minlat", "maxlon", "maxlat")
+    if all(k in attributes for k in names):
+        texts = [attributes[k] for k in names]
+    elif attributes.get("box", "").count(",") == 3:
+        south, west, north, east = attributes["box"].split(",")
+        texts = [west, south, east, north]
+    else:
+        return None
+    west_, south_, east_, north_ = (float(t) for t in texts)
+    if not (-180 <= west_ <= 180 and -180 <= east_ <= 180 and -90 <= south_ <= north_ <= 90):
+        reason = f"the bounds {', '.join(texts)} are no box on earth"
+        raise UnreadableFile(reason, [Problem(reason, where="<bounds>")])
+    return west_, south_, east_, north_
+
+
+class _Network:
+    """Which nodes and ways are the highway network.
+
+    place: node id -> its place in the columns, of the last node with that id. used: ids of the network's nodes.
+    """
+
+    def __init__(self, data: Data, context: ReadContext) -> None:
+        self.data = data
+        self.place = {identity: k for k, identity in enumerate(data.ids)}
+        if len(self.place) != len(data.ids):
+            _warn_twice("node", data.ids, context)
+        ways = {way.id: way for way in data.ways}
+        if len(ways) != len(data.ways):
+            _warn_twice("way", [way.id for way in data.ways], context)
+        self.ways = list(ways.values())
+        lost = set(np.array(data.ids, np.int64)[np.isnan(data.lonlat[:, 0])].tolist()) if len(data.ids) else set()
+        self.placed = self.place.keys() - lost if lost else self.place.keys()
+        self.highways: list[tuple[Way, Edges]] = []
+        used: dict[int, None] = {}
+        gone: set[int] = set()
+        for way in self.ways:
+            if "highway" not in way.tags:
+                continue
+            if deleted(way.attributes):
+                context.warn("the way is marked as deleted, so it is no part of the network", where=f"way {way.id}")
+                continue
+            self._doubts(way, context)
+            here = [r for r in way.refs if r in self.placed]
+            absent = set(way.refs) - set(here) if len(here) < len(way.refs) else set()
+            used.update(dict.fromkeys(here))
+            self.highways.append((way, way_edges(way.id, way.refs, way.tags, absent)))
+            gone.update(absent)
+        self.used = used
+        if gone:
+            some = ", ".join(map(str, sorted(gone)[:5]))
+            context.warn(f"highways use {len(gone)} nodes that have no place in the file ({some}); gaps are left there")
+
+    def _doubts(self, way: Way, context: ReadContext) -> None:
+        where = f"way {way.id}"
+        if any(a == b for a, b in pairwise(way.refs)):
+            context.warn("the way goes from a node to itself; that segment is no edge", where=where)
+        said = str(way.tags.get("oneway", "no")).strip().lower()
+        if said not in _FORWARD and said not in _BACKWARD and said not in _NO:
+            context.warn(f"oneway={said[:40]} is not known; the way is taken as two-way", where=where)
+
+    def features(self, document: Properties) -> Features:
+        data = self.data
+        wanted = sorted(self.place[i] for i in self.used)
+        ids = [f"n{data.ids[k]}" for k in wanted]
+        properties: list[Properties] = [{"kind": "node", "osm": _of_node(data, k)} for k in wanted]
+        source: list[int] = []
+        target: list[int] = []
+        for way, edges in self.highways:
+            said = {"way": way.id, "tags": way.tags}
+            ids += edges.ids
+            source += edges.source
+            target += edges.target
+            properties += [
+                {"kind": "edge", "source": f"n{a}", "target": f"n{b}", "osm": said}
+                for a, b in zip(edges.source, edges.target, strict=True)
+            ]
+        geometry = points(data.lonlat[wanted]) if wanted else np.empty(0, object)
+        if source:
+            start = np.fromiter(map(self.place.__getitem__, source), np.intp, len(source))
+            end = np.fromiter(map(self.place.__getitem__, target), np.intp, len(target))
+            geometry = np.concatenate([geometry, segments(data.lonlat[start], data.lonlat[end])])
+        about = {k: document[k] for k in ("bounds", "attribution") if k in document}
+        return from_columns(ids, geometry, properties, "wgs84", about)
+
+
+def _warn_twice(what: str, ids: list[int], context: ReadContext) -> None:
+    seen: set[int] = set()
+    for identity in ids:
+        if identity in seen:
+            context.warn("the id stands more than once in the file; the last one counts", where=f"{what} {identity}")
+        seen.add(identity)
+
+
+def _of_node(data: Data, k: int) -> dict[str, Any]:
+    said: dict[str, Any] = {}
+    if tags := data.tags.get(k):
+        said["tags"] = tags
+    if attributes := data.attributes(k):
+        said["attributes"] = attributes
+    if children := data.node_children.get(k):
+        said["children"] = [list(c) for c in children]
+    return said
+
+
+def _properties(said: dict[str, Any], tags: Tags, otherwise: str) -> Properties:
+    kind = kind_of(tags, otherwise)
+    name = tags.get("name")
+    return {"kind": kind, "name": name, "osm": said} if name else {"kind": kind, "osm": said}
+
+
+def _objects(data: Data, network: _Network, context: ReadContext, document: Properties) -> Features:
+    """Tagged and lone nodes, ways and relations as features, in the file's order."""
+    place = network.place
+    relations = {r.id: r for r in data.relations}
+    if len(relations) != len(data.relations):
+        _warn_twice("relation", [r.id for r in data.relations], context)
+    flat = list(chain.from_iterable(way.refs for way in network.ways))
+    bent = set(flat)
+    members = {i for r in data.relations for kind, i, _ in r.members if kind == "node"}
+    nodes = []
+    for identity, k in place.items():
+        if identity in network.used:
+            continue
+        lone = identity not in bent or k in data.tags or identity in members or identity not in network.placed
+        if lone or k in data.node_children or deleted(data.attributes(k)):
+            nodes.append(k)
+            if identity not in network.placed:
+                context.warn("the node has no place", where=f"node {identity}")
+    features = {data.ids[k] for k in nodes} | network.used.keys()
+    ids = [f"n{data.ids[k]}" for k in nodes]
+    properties = [_properties(_of_node(data, k), data.tags.get(k, {}), "point") for k in nodes]
+    geometry = np.empty(len(nodes), object)
+    at = data.lonlat[nodes] if nodes else np.empty((0, 2))
+    there = ~np.isnan(at[:, 0])
+    geometry[there] = points(at[there])
+    geometry[~there] = NO_GEOMETRY
+    dangling = 0
+    index = np.fromiter((place.get(r, -1) for r in flat), np.intp, len(flat))
+    lonlat = np.concatenate([data.lonlat, np.full((1, 2), np.nan)])[index]
+    absent = np.isnan(lonlat[:, 0])
+    begin = 0
+    for way in network.ways:
+        end = begin + len(way.refs)
+        said: dict[str, Any] = {"refs": way.refs, "tags": way.tags}
+        if way.attributes:
+            said["attributes"] = way.attributes
+        if absent[begin:end].any():
+            missing = np.flatnonzero(absent[begin:end]).tolist()
+            said["missing"] = missing
+            dangling += len(missing)
+        if vertices := _vertices(data, way.refs, index[begin:end].tolist(), features):
+            said["vertices"] = vertices
+        if way.children:
+            said["children"] = [list(c) for c in way.children]
+        if not way.refs:
+            context.warn("the way has no nodes", where=f"way {way.id}")
+        properties.append(_properties(said, way.tags, "line"))
+        begin = end
+    if dangling:
+        context.warn(f"ways refer {dangling} times to nodes that have no place in the file; the references are kept")
+    ids += [f"w{way.id}" for way in network.ways]
+    shapes = _way_geometry(network.ways, lonlat, absent)
+    for relation in relations.values():
+        said = {"members": [list(m) for m in relation.members], "tags": relation.tags}
+        if relation.attributes:
+            said["attributes"] = relation.attributes
+        if relation.children:
+            said["children"] = [list(c) for c in relation.children]
+        properties.append(_properties(said, relation.tags, "relation"))
+    ids += [f"r{i}" for i in relations]
+    nothing = np.full(len(relations), NO_GEOMETRY, object)
+    return from_columns(ids, np.concatenate([geometry, shapes, nothing]), properties, "wgs84", document)
+
+
+def _vertices(data: Data, refs: list[int], index: list[int], features: set[int]) -> Any:
+    """The attributes of a way's nodes that are no features: one mapping where all agree, else a list like refs."""
+    rows = [None if k < 0 or r in features else data.attributes(k) for r, k in zip(refs, index, strict=True)]
+    own = [row for row in rows if row is not None]
+    if not own or not any(own):
+        return None
+    first = own[0]
+    return first if all(row is first or row == first for row in own) else rows
+
+
+def _way_geometry(ways: list[Way], lonlat: NDArray[np.float64], absent: NDArray[np.bool_]) -> NDArray[np.object_]:
+    """For each way the line, area, point or nothing that its nodes with a place make."""
+    owner = np.repeat(np.arange(len(ways)), [len(way.refs) for way in ways])[~absent]
+    lonlat = lonlat[~absent]
+    size = np.bincount(owner, minlength=len(ways))
+    out = np.full(len(ways), NO_GEOMETRY, object)
+    area = np.array([w.refs[:1] == w.refs[-1:] and len(w.refs) > 3 and is_area(w.tags) for w in ways], bool)
+    first = np.cumsum(size) - size
+    closed = area & (size > 3)
+    if len(lonlat):
+        ends = np.clip(first + size - 1, 0, len(lonlat) - 1)
+        closed &= (lonlat[np.clip(first, 0, len(lonlat) - 1)] == lonlat[ends]).all(axis=1)
+    for chosen, make in ((closed, shapely.linearrings), (~closed & (size > 1), shapely.linestrings)):
+        if chosen.any():
+            rows = chosen[owner]
+            number = np.cumsum(chosen) - 1
+            made = make(lonlat[rows], indices=number[owner[rows]])
+            out[chosen] = shapely.polygons(made) if make is shapely.linearrings else made
+    single = np.flatnonzero(size == 1)
+    out[single] = points(lonlat[first[single]])
+    return out
+
+
+# --- writing -----------------------------------------------------------------------------------------------------
+
+MOST_NODES = 2000
+"""Nodes a way may have (OSM API 0.6)."""
+
+NOWHERE = (float("nan"), float("nan"))
+NOTHING: Mapping[str, str] = {}
+
+
+@dataclass(slots=True)
+class _Node:
+    lon: float
+    lat: float
+    tags: Mapping[str, str] = field(default_factory=dict)
+    attributes: Mapping[str, str] = field(default_factory=dict)
+    vertex: bool = False
+
+
+@dataclass(slots=True)
+class _Level:
+    """What is being written of one level. nodes: feature id -> OSM id. edges: id -> (source, target, tags)."""
+
+    name: str
+    nodes: dict[str, int] = field(default_factory=dict)
+    moved: dict[int, int] = field(default_factory=dict)
+    edges: dict[str, tuple[str, str, Mapping[str, str] | None]] = field(default_factory=dict)
+    explained: set[str] = field(default_factory=set)
+    ways: dict[int, list[int]] = field(default_factory=dict)
+    relations: dict[int, int] = field(default_factory=dict)
+    has_network: bool = False
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``map.osm``. Raises MissingDatum where anything is in metres and there is no datum."""
+    out = _Writer(layers, context)
+    levels = list(dict.fromkeys(key.level for key in sorted(layers.parts)))
+    for level in sorted(levels, key=lambda name: (name != GROUND, name)):
+        out.level(level)
+    for key, part in sorted(layers.parts.items()):
+        if key.layer not in CARRIES and isinstance(part, Features) and key.layer == "location":
+            context.drop("GNSS fence", len(part), "OSM has no word for it; its box is the map's bounds")
+    if layers.datum is not None:
+        context.drop("datum", 1, "OSM places stand on earth and have no local frame")
+    return {"map.osm": out.text().encode()}
+
+
+class _Writer:
+    def __init__(self, layers: Layers, context: WriteContext) -> None:
+        self.layers = layers
+        self.context = context
+        self.nodes: dict[int, _Node] = {}
+        self.ways: dict[int, tuple[list[int], Mapping[str, str], Mapping[str, str]]] = {}
+        self.relations: dict[int, tuple[list[tuple[str, int, str]], Mapping[str, str], Mapping[str, str]]] = {}
+        rows = (p for part in layers.vector("objects").values() for p in part.properties)
+        own = [p for p in rows if isinstance(p.get("osm"), Mapping)]
+        refs = [refs for p in own if (refs := _integers(p["osm"].get("refs")))]
+        known = [_number(i) for part in layers.parts.values() if isinstance(part, Features) for i in part.ids]
+        lowest = min(chain([0], (min(r) for r in refs), (k[1] for k in known if k)))
+        self.next = {"node": lowest - 1, "way": lowest - 1, "relation": lowest - 1}
+        self.referenced = set(chain.from_iterable(refs))
+        self.lost: dict[str, int] = {}
+
+    def fresh(self, what: str) -> int:
+        new = self.next[what]
+        self.next[what] = new - 1
+        return new
+
+    def lose(self, what: str, times: int = 1) -> None:
+        self.lost[what] = self.lost.get(what, 0) + times
+
+    # --- one level ---
+
+    def level(self, name: str) -> None:
+        level = _Level(name)
+        drawn: set[Any] = set()
+        topology = list(self.layers.vector("topology", name).values())
+        for part in topology:
+            self.network_nodes(part, level)
+            drawn.update(p.get("drawn_from") for p in part.properties if "drawn_from" in p)
+        others: list[tuple[str, Any, Properties, bool]] = []
+        mine: list[tuple[str, int, Any, Mapping[str, Any], Mapping[str, Any]]] = []
+        for layer in ("objects", "zones"):
+            for key, part in self.layers.vector("objects" if layer == "objects" else "zones", name).items():
+                for i, geometry, properties in zip(
+                    part.ids, part.in_wgs84(self.layers.frame), part.properties, strict=True
+                ):
+                    number, said = _number(i), properties.get("osm")
+                    if layer == "objects" and key.name == FAMILY and number and isinstance(said, Mapping):
+                        mine.append((number[0], number[1], geometry, said, properties))
+                    elif i in drawn and shapely.get_type_id(geometry) in (0, 1, 2, 5):
+                        # The network made from this drawing is written; the line would lie on it a second time.
+                        continue
+                    else:
+                        others.append((i, geometry, properties, layer == "zones"))
+        for what, own, geometry, said, _ in mine:
+            if what == "n":
+                self.node(level, own, geometry, said)
+        for what, own, geometry, said, properties in mine:
+            if what == "w" and not self.way(level, own, geometry, said):
+                others.append((f"w{own}", geometry, properties, False))
+        for what, own, _, _, _ in mine:
+            if what == "r":
+                level.relations[own] = self.fresh("relation") if own in self.relations else own
+                self.relations[level.relations[own]] = ([], NOTHING, NOTHING)
+        for what, own, _, said, _ in mine:
+            if what == "r":
+                self.relation(level, own, said)
+        for part in topology:
+            self.new_ways(part, level)
+        for i, geometry, properties, zone in others:
+            self.other(level, i, geometry, properties, zone)
+
+    def network_nodes(self, part: Features, level: _Level) -> None:
+        level.has_network = True
+        is_node = np.array([p.get("kind") != "edge" for p in part.properties], bool)
+        chosen = np.flatnonzero(is_node)
+        at = part.take(chosen).in_wgs84(self.layers.frame) if len(chosen) else np.empty(0, object)
+        lon, lat = shapely.get_x(at).tolist(), shapely.get_y(at).tolist()
+        for k, x, y, geometry in zip(chosen.tolist(), lon, lat, at, strict=True):
+            i, properties = part.ids[k], part.properties[k]
+            said = properties.get("osm")
+            number = _number(i)
+            own = (
+                number is not None and number[0] == "n" and (isinstance(said, Mapping) or number[1] in self.referenced)
+            )
+            new = number[1] if own and number is not None else self.fresh("node")
+            if new in self.nodes and (self.nodes[new].lon, self.nodes[new].lat) != (x, y):
+                new = self.fresh("node")
+            if isinstance(said, Mapping):
+                tags, attributes = _texts(said.get("tags")), _texts(said.get("attributes"))
+            else:
+                tags, attributes = self.tags(i, properties, ("name",)), NOTHING
+            if geometry.has_z and "ele" not in tags:
+                tags = {**tags, "ele": repr(float(geometry.z))}
+            self.nodes[new] = _Node(x, y, tags, attributes)
+            level.nodes[i] = new
+            if own and number is not None:
+                level.moved[number[1]] = new
+        for k in np.flatnonzero(~is_node).tolist():
+            p = part.properties[k]
+            said = p.get("osm")
+            tags_ = said.get("tags") if isinstance(said, Mapping) else None
+            level.edges[part.ids[k]] = (
+                str(p.get("source")),
+                str(p.get("target")),
+                tags_ if isinstance(tags_, Mapping) else None,
+            )
+
+    def node(self, level: _Level, number: int, geometry: Any, said: Mapping[str, Any]) -> None:
+        if number in level.moved:
+            return
+        x, y = (geometry.x, geometry.y) if geometry.geom_type == "Point" and not geometry.is_empty else NOWHERE
+        new = number
+        if number in self.nodes and (self.nodes[number].lon, self.nodes[number].lat) != (x, y):
+            new = self.fresh("node")
+        self.nodes[new] = _Node(x, y, _texts(said.get("tags")), _texts(said.get("attributes")))
+        level.moved[number] = new
+        if said.get("children"):
+            self.lose("elements that OSM does not know", len(said["children"]))
+
+    def way(self, level: _Level, number: int, geometry: Any, said: Mapping[str, Any]) -> bool:
+        """Write an OSM way; False where its properties or its geometry are no longer those of one."""
+        refs = _integers(said.get("refs"))
+        at = _course(geometry)
+        if refs is None or at is None:
+            return False
+        tags, attributes = _texts(said.get("tags")), _texts(said.get("attributes"))
+        if said.get("children"):
+            self.lose("elements that OSM does not know", len(said["children"]))
+        missing = set(_integers(said.get("missing")) or ())
+        first = self.fresh("way") if number in self.ways else number
+        if level.has_network and "highway" in tags and not deleted(attributes):
+            runs = self.runs(level, number, refs, tags, {refs[k] for k in missing if 0 <= k < len(refs)})
+        else:
+            runs = [(0, len(refs), tags)]
+        written: list[int] = []
+        for begin, end, said_tags in runs:
+            new = self.fresh("way") if written else first
+            whole = end - begin == len(refs)
+            nodes = self.bend(level, refs, at, missing, said.get("vertices"), range(begin, end))
+            self.ways[new] = (nodes, said_tags, attributes if whole or not written else NOTHING)
+            written.append(new)
+        if not written:
+            self.lose("ways whose edges are no longer in the network")
+        level.ways[number] = written
+        return True
+
+    def runs(
+        self, level: _Level, number: int, refs: list[int], tags: Mapping[str, str], absent: set[int]
+    ) -> list[tuple[int, int, Mapping[str, str]]]:
+        """The pieces of a highway way that the network still has: (first, one past the last index of refs, tags)."""
+        expected = way_edges(number, refs, tags, absent)
+        # Of each segment: the directions that are there, of those that the way means, and the tags if they differ.
+        there: dict[int, tuple[set[str], Any]] = {}
+        wanted: dict[int, int] = {}
+        for k, i, a, b in zip(expected.segment, expected.ids, expected.source, expected.target, strict=True):
+            wanted[k] = wanted.get(k, 0) + 1
+            edge = level.edges.get(i)
+            if edge is not None and edge[0] == f"n{a}" and edge[1] == f"n{b}":
+                level.explained.add(i)
+                ways, _ = there.get(k, (set(), None))
+                ways.add("forward" if a == refs[k] else "backward")
+                other = edge[2] if edge[2] is not None and edge[2] != tags else None
+                there[k] = (ways, other)
+        if all(k in there and len(there[k][0]) == n and there[k][1] is None for k, n in wanted.items()):
+            return [(0, len(refs), tags)]
+        out: list[tuple[int, int, Mapping[str, str]]] = []
+        state: Any = None
+        for k in range(len(refs) - 1):
+            if k in wanted and k not in there:
+                state = None
+                continue
+            said = tags
+            if k in there:
+                ways, other = there[k]
+                said = _texts(other) if other is not None else tags
+                if len(ways) < wanted[k]:
+                    said = {**said, "oneway": "yes" if "forward" in ways else "-1"}
+            elif state is not None:
+                said = state
+            if state is not None and said == state and out:
+                out[-1] = (out[-1][0], k + 2, said)
+            else:
+                out.append((k, k + 2, said))
+            state = said
+        return out
+
+    def bend(
+        self,
+        level: _Level,
+        refs: list[int],
+        at: NDArray[np.float64],
+        missing: set[int],
+        vertices: Any,
+        wanted: range,
+    ) -> list[int]:
+        """The node ids of (part of) a way, making those that exist nowhere but in the way."""
+        located = len(refs) - len(missing)
+        if located != len(at):
+            return self.redraw(level, refs, at)
+        attributes = vertices if isinstance(vertices, list) and len(vertices) == len(refs) else [vertices] * len(refs)
+        places = at.tolist()
+        out, j = [], 0
+        for k, ref in enumerate(refs):
+            place = None
+            if k not in missing:
+                place = places[j]
+                j += 1
+            if k not in wanted:
+                continue
+            new = level.moved.get(ref, ref)
+            known = self.nodes.get(new)
+            if place is not None:
+                if known is None:
+                    self.nodes[new] = _Node(place[0], place[1], NOTHING, _texts(attributes[k]), vertex=True)
+                elif known.vertex and (known.lon != place[0] or known.lat != place[1]):
+                    # Two ways no longer agree where their common node is: each keeps its course.
+                    new = self.fresh("node")
+                    self.nodes[new] = _Node(place[0], place[1], vertex=True)
+            out.append(new)
+        return out
+
+    def redraw(self, level: _Level, refs: list[int], at: NDArray[np.float64]) -> list[int]:
+        """Nodes for a way whose geometry was edited: its own where one stands at a vertex, else new ones."""
+        known = {}
+        for ref in refs:
+            node = self.nodes.get(level.moved.get(ref, ref))
+            if node is not None:
+                known[node.lon, node.lat] = level.moved.get(ref, ref)
+        out = []
+        for x, y in at.tolist():
+            if (x, y) not in known:
+                known[x, y] = new = self.fresh("node")
+                self.nodes[new] = _Node(x, y, vertex=True)
+            out.append(known[x, y])
+        return out
+
+    def relation(self, level: _Level, number: int, said: Mapping[str, Any]) -> None:
+        members: list[tuple[str, int, str]] = []
+        rows = said.get("members")
+        for row in rows if isinstance(rows, list) else []:
+            if not (isinstance(row, list | tuple) and len(row) == 3 and type(row[1]) is int and abs(row[1]) < INT64):
+                self.lose("relation members that are not [type, id, role]")
+                continue
+            kind, i, role = str(row[0]), row[1], str(row[2])
+            if kind == "way" and i in level.ways:
+                members += [(kind, new, role) for new in level.ways[i]]
+                if not level.ways[i]:
+                    self.lose("relation members whose way is no longer in the network")
+            elif kind == "node":
+                members.append((kind, level.moved.get(i, i), role))
+            elif kind == "relation":
+                members.append((kind, level.relations.get(i, i), role))
+            else:
+                members.append((kind, i, role))
+        if said.get("children"):
+            self.lose("elements that OSM does not know", len(said["children"]))
+        tags, attributes = _texts(said.get("tags")), _texts(said.get("attributes"))
+        self.relations[level.relations[number]] = (members, tags, attributes)
+
+    def new_ways(self, part: Features, level: _Level) -> None:
+        """Edges that no way explains, joined to lines where they follow each other and say the same."""
+        left = [
+            k
+            for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True))
+            if p.get("kind") == "edge" and i not in level.explained
+        ]
+        if not left:
+            return
+        chosen = part.take(left)
+        pairs: dict[tuple[int, int], list[int]] = {}
+        signs: list[tuple[Any, ...]] = []
+        for k, (i, p) in enumerate(zip(chosen.ids, chosen.properties, strict=True)):
+            a, b = level.nodes.get(str(p.get("source"))), level.nodes.get(str(p.get("target")))
+            tags = self.edge_tags(i, p, level)
+            signs.append((p.get("drawn_from"), tuple(sorted(tags.items()))))
+            if a is None or b is None:
+                self.lose("edges without both nodes")
+            else:
+                pairs.setdefault((a, b), []).append(k)
+        course: Any = None
+        line: list[int] = []
+        state: tuple[Any, ...] | None = None
+        for (a, b), edges in pairs.items():
+            for n, k in enumerate(edges):
+                if k < 0:
+                    continue
+                back = pairs.get((b, a), []) if a != b else []
+                twin = n < len(back) and back[n] >= 0 and signs[back[n]] == signs[k]
+                if twin:
+                    back[n] = -1
+                if course is None and shapely.get_num_coordinates(chosen.geometry).max() > 2:
+                    course = chosen.in_wgs84(self.layers.frame)
+                nodes = [a, *self.inner(course[k] if course is not None else None), b]
+                sign = (*signs[k], twin)
+                if sign == state and line[-1] == a and len(line) + len(nodes) <= MOST_NODES:
+                    line += nodes[1:]
+                elif sign == state and twin and line[-1] == b and len(line) + len(nodes) <= MOST_NODES:
+                    line += nodes[-2::-1]
+                else:
+                    line, state = nodes, sign
+                    tags = dict(signs[k][1])
+                    if not twin:
+                        tags["oneway"] = "yes"
+                    elif direction(tags) != "both":
+                        tags["oneway"] = "no"
+                    self.ways[self.fresh("way")] = (line, tags, NOTHING)
+
+    def inner(self, geometry: Any) -> list[int]:
+        """New nodes for what an edge bends over between its ends."""
+        if geometry is None or geometry.geom_type != "LineString":
+            return []
+        out = []
+        for x, y in shapely.get_coordinates(geometry)[1:-1].tolist():
+            out.append(self.fresh("node"))
+            self.nodes[out[-1]] = _Node(x, y, vertex=True)
+        return out
+
+    def edge_tags(self, i: str, p: Properties, level: _Level) -> dict[str, str]:
+        said = p.get("osm")
+        if isinstance(said, Mapping) and isinstance(said.get("tags"), Mapping):
+            return {k: v for k, v in _texts(said["tags"]).items() if k != "oneway"}
+        tags = {"highway": "path"}
+        for word, key in (("name", "name"), ("action", "action"), ("width", "width")):
+            value = p.get(word)
+            if isinstance(value, str | int | float) and not isinstance(value, bool) and value != i:
+                tags[key] = str(value)
+        speed = p.get("speed_limit")
+        if isinstance(speed, int | float) and not isinstance(speed, bool):
+            tags["maxspeed"] = f"{speed * 3.6:.6g}"
+        if level.name != GROUND:
+            tags["level"] = level.name
+        more = {"kind", "source", "target", "drawn_from", "name", "action", "width", "speed_limit"}
+        if p.keys() - more:
+            self.lose("edges' further properties")
+        return tags
+
+    # --- items of other formats ---
+
+    def tags(self, i: str, p: Properties, words: Iterable[str] = (), level: str = GROUND) -> dict[str, str]:
+        """Tags for an item that OSM does not know: its name, and the plain values among these words (or all)."""
+        tags = {"name": str(p.get("name") or i)}
+        names = list(words) or [k for k in p if k not in ("drawn_from",)]
+        for k in names:
+            value = p.get(k)
+            if isinstance(value, bool):
+                tags[k] = "yes" if value else "no"
+            elif isinstance(value, str | int | float):
+                tags[k] = str(value)
+        if any(isinstance(v, Mapping | list | tuple) for v in p.values()):
+            self.lose("nested properties of items from other formats")
+        if level != GROUND:
+            tags.setdefault("level", level)
+        return {k: v for k, v in tags.items() if k and v}
+
+    def other(self, level: _Level, i: str, geometry: Any, properties: Properties, zone: bool) -> None:
+        tags = self.tags(i, properties, level=level.name)
+        said = properties.get("osm")
+        if isinstance(said, Mapping):
+            tags = {**_texts(said.get("tags")), **tags}
+        if zone:
+            tags["zone"] = str(properties.get("kind") or "yes")
+        parts = _simple(geometry)
+        if not parts:
+            self.lose("items without a geometry")
+        rings: list[tuple[int, str]] = []
+        areas = [p for p in parts if p.geom_type == "Polygon"]
+        single = len(areas) == 1 and not len(areas[0].interiors)
+        for part in parts:
+            if part.geom_type == "Point":
+                x, y = part.x, part.y
+                self.nodes[self.fresh("node")] = _Node(x, y, tags)
+            elif part.geom_type == "Polygon" and not single:
+                rings.append((self.line(part.exterior, NOTHING), "outer"))
+                rings += [(self.line(r, NOTHING), "inner") for r in part.interiors]
+            elif part.geom_type == "Polygon":
+                self.line(part.exterior, {**tags, "area": "yes"})
+            else:
+                self.line(part, tags)
+        if rings:
+            members = [("way", number, role) for number, role in rings]
+            self.relations[self.fresh("relation")] = (members, {**tags, "type": "multipolygon"}, NOTHING)
+
+    def line(self, geometry: Any, tags: Mapping[str, str]) -> int:
+        """A way along a line or ring, with nodes of its own. A line too long for one way goes on in further ones."""
+        at = shapely.get_coordinates(geometry).tolist()
+        nodes = []
+        for x, y in at[:-1]:
+            nodes.append(self.fresh("node"))
+            self.nodes[nodes[-1]] = _Node(x, y, vertex=True)
+        if at[0] == at[-1] and len(at) > 2:
+            nodes.append(nodes[0])
+        else:
+            nodes.append(self.fresh("node"))
+            self.nodes[nodes[-1]] = _Node(at[-1][0], at[-1][1], vertex=True)
+        first = self.fresh("way")
+        self.ways[first] = (nodes[:MOST_NODES], tags, NOTHING)
+        for begin in range(MOST_NODES - 1, len(nodes) - 1, MOST_NODES - 1):
+            self.ways[self.fresh("way")] = (nodes[begin : begin + MOST_NODES], tags, NOTHING)
+        return first
+
+    # --- XML ---
+
+    def text(self) -> str:
+        for what, times in sorted(self.lost.items()):
+            self.context.drop(what, times, "OSM has no place for them")
+        cache: dict[int, str] = {}
+
+        def attributes(said: Mapping[str, str]) -> str:
+            if not said:
+                return ""
+            known = cache.get(id(said))
+            if known is None:
+                # Keyed by identity: thousands of elements of one changeset share one mapping, which lives here.
+                known = cache[id(said)] = _attribute_text(said, _RESERVED)
+            return known
+
+        lines = ['<?xml version="1.0" encoding="UTF-8"?>', *self.head()]
+        order = sorted(self.nodes, key=_order)
+        lon = _degrees([self.nodes[i].lon for i in order])
+        lat = _degrees([self.nodes[i].lat for i in order])
+        for i, x, y in zip(order, lon, lat, strict=True):
+            node = self.nodes[i]
+            place = f' lat="{y}" lon="{x}"' if x is not None else ""
+            if node.tags:
+                lines.append(f' <node id="{i}"{attributes(node.attributes)}{place}>')
+                lines += _tag_lines(node.tags)
+                lines.append(" </node>")
+            else:
+                lines.append(f' <node id="{i}"{attributes(node.attributes)}{place}/>')
+        for i in sorted(self.ways, key=_order):
+            refs, tags, said = self.ways[i]
+            if not refs and not tags:
+                lines.append(f' <way id="{i}"{attributes(said)}/>')
+                continue
+            lines.append(f' <way id="{i}"{attributes(said)}>')
+            lines += [f'  <nd ref="{r}"/>' for r in refs]
+            lines += _tag_lines(tags)
+            lines.append(" </way>")
+        for i in sorted(self.relations, key=_order):
+            members, tags, said = self.relations[i]
+            if not members and not tags:
+                lines.append(f' <relation id="{i}"{attributes(said)}/>')
+                continue
+            lines.append(f' <relation id="{i}"{attributes(said)}>')
+            lines += [f'  <member type="{_escape(t)}" ref="{r}" role="{_escape(role)}"/>' for t, r, role in members]
+            lines += _tag_lines(tags)
+            lines.append(" </relation>")
+        lines.append("</osm>\n")
+        return "\n".join(lines)
+
+    def head(self) -> list[str]:
+        documents = [p.document for p in self.layers.parts.values() if isinstance(p, Features)]
+        said = [d["osm"] for d in documents if isinstance(d.get("osm"), Mapping)]
+        root: dict[str, str] = {"version": "0.6", "generator": GENERATOR}
+        for one in said:
+            root |= _texts(one.get("attributes"))
+        root["version"] = "0.6"
+        if self.context.attribution and not root.keys() & {"attribution", "copyright", "license"}:
+            root["attribution"] = "; ".join(self.context.attribution)
+        lines = [f"<osm{_attribute_text(root, frozenset())}>"]
+        for one in said:
+            rows = one.get("elements")
+            for row in rows if isinstance(rows, list) else []:
+                name, attributes, text = row
+                if _NAME.fullmatch(str(name)):
+                    inner = _escape(str(text))
+                    lines.append(f" <{name}{_attribute_text(_texts(attributes), frozenset())}>{inner}</{name}>")
+        boxes = [d["bounds"] for d in documents if _is_box(d.get("bounds"))]
+        if not boxes:
+            boxes = self.fence()
+        if boxes:
+            west, south, east, north = zip(*boxes, strict=True)
+            texts = numbers(np.array([min(south), min(west), max(north), max(east)], np.float64), DEGREES)
+            names = ("minlat", "minlon", "maxlat", "maxlon")
+            box = {k: _plain(v) for k, v in zip(names, texts, strict=True)}
+            kept = [_texts(b) for one in said for b in one.get("bounds") or []]
+            if len(kept) == 1 and all(k in box or k not in names for k in kept[0]):
+                box = {**{k: v for k, v in kept[0].items() if k != "box"}, **box}
+            lines.append(f" <bounds{_attribute_text(box, frozenset())}/>")
+        return lines
+
+    def fence(self) -> list[list[float]]:
+        """The boxes of the sites, where they can be had on earth."""
+        out: list[list[float]] = []
+        for part in self.layers.vector("location").values():
+            if self.layers.frame is not None or not part.local.any():
+                boxes = shapely.bounds(part.in_wgs84(self.layers.frame))
+                out += boxes[~np.isnan(boxes).any(axis=1)].tolist()
+        return out
+
+
+_ID = re.compile(r"([nwr])(-?\d{1,19})", re.ASCII)
+_NAME = re.compile(r"[A-Za-z_][\w.:-]*", re.ASCII)
+_RESERVED = frozenset({"id", "lat", "lon"})
+_SPECIAL = re.compile('[&<>"\\x00-\\x1f\\ud800-\\udfff\\ufffe\\uffff]')
+_ESCAPES = {"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"}
+
+
+def _escape(text: str) -> str:
+    """Text as it may stand in an attribute; what XML cannot say at all becomes the replacement character."""
+    return _SPECIAL.sub(lambda m: _ESCAPES.get(m[0], "\ufffd"), text) if _SPECIAL.search(text) else text
+
+
+def _number(i: str) -> tuple[str, int] | None:
+    match = _ID.fullmatch(i)
+    if match is None or abs(int(match[2])) >= INT64 or str(int(match[2])) != match[2]:
+        return None
+    return match[1], int(match[2])
+
+
+def _order(i: int) -> tuple[bool, int]:
+    """The order of the OSM tools: negative ids first, by magnitude."""
+    return i > 0, abs(i)
+
+
+def _integers(value: Any) -> list[int] | None:
+    """A list of 64 bit integers, or None where it is not one (properties can be edited by anybody)."""
+    if not isinstance(value, list | tuple):
+        return None
+    return list(value) if all(type(v) is int and abs(v) < INT64 for v in value) else None
+
+
+def _texts(value: Any) -> Mapping[str, str]:
+    """A mapping of texts to texts, whatever was stored."""
+    if not isinstance(value, Mapping):
+        return NOTHING
+    if all(type(v) is str for v in value.values()):
+        return value
+    return {k: v if isinstance(v, str) else str(v) for k, v in value.items() if v is not None}
+
+
+def _course(geometry: Any) -> NDArray[np.float64] | None:
+    """The vertices of a way's geometry; None where it is not of one piece."""
+    whole = geometry.geom_type in ("LineString", "LinearRing", "Point") or geometry.is_empty
+    if whole or (geometry.geom_type == "Polygon" and not len(geometry.interiors)):
+        return np.asarray(shapely.get_coordinates(geometry), np.float64)
+    return None
+
+
+def _simple(geometry: Any) -> list[Any]:
+    """Points, lines and polygons of a geometry, however deep."""
+    todo, out = [geometry], []
+    while todo:
+        one = todo.pop()
+        if one.is_empty:
+            continue
+        if hasattr(one, "geoms"):
+            todo += reversed(one.geoms)
+        else:
+            out.append(one)
+    return out
+
+
+def _degrees(values: list[float]) -> list[str | None]:
+    return [None if v == "nan" else _plain(v) for v in numbers(values, DEGREES)]
+
+
+def _plain(text: str) -> str:
+    """Never an exponent: not all readers of OSM know one."""
+    return f"{float(text):.12f}".rstrip("0") if "e" in text else text
+
+
+def _attribute_text(said: Mapping[str, str], without: frozenset[str]) -> str:
+    return "".join(f' {k}="{_escape(v)}"' for k, v in said.items() if k not in without and _NAME.fullmatch(k))
+
+
+def _tag_lines(tags: Mapping[str, str]) -> list[str]:
+    return [f'  <tag k="{_escape(k)}" v="{_escape(v)}"/>' for k, v in tags.items()]
+
+
+def _is_box(value: Any) -> bool:
+    return (
+        isinstance(value, list | tuple)
+        and len(value) == 4
+        and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+    )
+
+
+CARRIES = frozenset[Any]({"topology", "objects", "zones"})
+
+register(
+    Format(
+        name="osm",
+        title="OpenStreetMap",
+        files=("map.osm",),
+        media_types=("application/vnd.openstreetmap.data+xml",),
+        carries=CARRIES,
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"objects"}), frozenset({"topology"})), anchor="wgs84"),
+        family=FAMILY,
+        rank=20,
+        extensions=(".osm", ".osm.xml", ".osm.gz", ".osm.bz2", ".pbf"),
+    )
+)
