@@ -51,7 +51,8 @@ def tmap2(name: str) -> bytes:
         "    edges: [{edge_id: %s, node: %s, action: move_base}]\n"
     )
     nodes = node % ("A", "A", "0.0", "A_B", "B") + node % ("B", "B", "1.0", "B_A", "A")
-    return f"meta: {{last_updated: 2022-01-01_00-00-00}}\nmetric_map: m\nname: {name}\npointset: p\nnodes:\n{nodes}".encode()
+    head = f"meta: {{last_updated: 2022-01-01_00-00-00}}\nmetric_map: m\nname: {name}\npointset: p\n"
+    return f"{head}nodes:\n{nodes}".encode()
 
 
 def told(files: dict[str, bytes], *, known: Known | None = None, **hints: Any) -> Bundle:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,45 +19,44 @@ from app.store.values import Version
 def match_ids(store: Store, base: Version, key: PartKey, new: Features) -> Features:
     """The new collection with the head's ids where a feature stands at the very place of one whose id has gone.
 
-    Features whose ids the head knows keep them. Of the others, one takes the id of a head feature that the upload
-    does not name, if kind, anchor and geometry are equal and the pair is the only one of its place. Edges follow
-    their nodes.
+    Features whose ids the head knows keep them, and so do those whose id is the name that people gave them (a renamed
+    waypoint is another waypoint to the robots). Of the others, one takes the id of a head feature that the upload does
+    not name, if kind, anchor and geometry are equal and the pair is the only one of its place; an edge must join the
+    same nodes, too.
     """
     stored = store.load(base, [key]).parts.get(key)
     if not isinstance(stored, Features) or not len(stored) or not len(new):
         return new
-    known, named = set(stored.ids), set(new.ids)
-    strange = [k for k, i in enumerate(new.ids) if i not in known]
-    gone = [k for k, i in enumerate(stored.ids) if i not in named]
-    if not strange or not gone:
-        return new
-    places = _places(stored, gone)
+    known, present = set(stored.ids), set(new.ids)
+    strange = [k for k, i in enumerate(new.ids) if i not in known and new.properties[k].get("name") != i]
+    gone = [k for k, i in enumerate(stored.ids) if i not in present]
     renamed: dict[str, str] = {}
-    for place, wanting in _places(new, strange).items():
-        left = places.get(place, [])
-        if len(wanting) == len(left) == 1:
-            renamed[new.ids[wanting[0]]] = stored.ids[left[0]]
+    for edges in (False, True):  # edges last, when their nodes are known
+        wanting = [k for k in strange if (new.properties[k].get("kind") == "edge") is edges]
+        left = [k for k in gone if (stored.properties[k].get("kind") == "edge") is edges]
+        if not wanting or not left:
+            continue
+        places = _places(stored, left, {})
+        for place, here in _places(new, wanting, renamed).items():
+            there = places.get(place, [])
+            if len(here) == len(there) == 1:
+                renamed[new.ids[here[0]]] = stored.ids[there[0]]
     if not renamed:
         return new
     ids = tuple(renamed.get(i, i) for i in new.ids)
-    properties = tuple(_renamed(i, p, renamed) for i, p in zip(new.ids, new.properties, strict=True))
+    properties = tuple(
+        {**p, **{w: renamed[p[w]] for w in ("source", "target") if p.get(w) in renamed}} for p in new.properties
+    )
     return replace(new, ids=ids, properties=properties)
 
 
-def _places(f: Features, where: list[int]) -> dict[tuple[Any, ...], list[int]]:
-    shapes = shapely.to_wkb(shapely.normalize(f.geometry[np.array(where, np.intp)]))
+def _places(f: Features, where: Sequence[int], renamed: dict[str, str]) -> dict[tuple[Any, ...], list[int]]:
+    """The features at each place: anchor, kind, shape and, for an edge, the nodes it joins."""
+    shapes = shapely.to_wkb(f.geometry[np.array(where, np.intp)])
     out: dict[tuple[Any, ...], list[int]] = defaultdict(list)
     for k, shape in zip(where, shapes, strict=True):
+        p = f.properties[k]
+        ends = tuple(renamed.get(p[w], p[w]) for w in ("source", "target") if isinstance(p.get(w), str))
         if not f.geometry[k].is_empty:
-            direction = f.geometry[k].coords[0] if f.properties[k].get("kind") == "edge" else None
-            out[(bool(f.local[k]), f.properties[k].get("kind"), direction, shape)].append(k)
+            out[(bool(f.local[k]), p.get("kind"), ends, shape)].append(k)
     return out
-
-
-def _renamed(old: str, properties: Any, renamed: dict[str, str]) -> Any:
-    changed = {w: renamed[properties[w]] for w in ("source", "target") if properties.get(w) in renamed}
-    if old in renamed and not properties.get("name") and properties.get("kind") != "edge":
-        changed["name"] = old  # the file's own name for it, which the way back must say again
-    if old in renamed and properties.get("kind") == "edge":
-        changed["edge_id"] = old
-    return {**properties, **changed} if changed else properties
