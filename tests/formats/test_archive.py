@@ -1,0 +1,251 @@
+"""ZIP archives: what is safe comes out byte for byte, what is not is refused before a byte is written anywhere."""
+
+from __future__ import annotations
+
+import io
+import stat
+import struct
+import unicodedata
+import zipfile
+import zlib
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from app.errors import BadUpload, TooLarge, UnreadableFile, UnsafeArchive
+from app.formats import Limits, _archive
+
+FILES = {"doc.kml": b"<kml/>" * 50, "images/é.png": bytes(range(256)), "empty.txt": b"", "inner.zip": b""}
+FILES["inner.zip"] = _archive.pack({"a.txt": b"inside"})
+
+
+def zipped(*members: tuple[str | zipfile.ZipInfo, bytes]) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, body in members:
+            archive.writestr(name, body)
+    return out.getvalue()
+
+
+class Pipe(io.RawIOBase):
+    """A target that cannot seek, so that sizes follow the data."""
+
+    def __init__(self) -> None:
+        self.body = bytearray()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data) -> int:
+        self.body += data
+        return len(data)
+
+
+def with_mode(mode: int, name: str = "a") -> bytes:
+    info = zipfile.ZipInfo(name)
+    info.create_system = 3
+    info.external_attr = mode << 16
+    return zipped((info, b"/etc/passwd"))
+
+
+def patched(data: bytes, mark: bytes, offset: int, new: bytes, which: int = 0) -> bytes:
+    """The archive with other bytes at this offset of the n-th header with this mark."""
+    at = -1
+    for _ in range(which + 1):
+        at = data.index(mark, at + 1)
+    return data[: at + offset] + new + data[at + offset + len(new) :]
+
+
+LOCAL, CENTRAL = b"PK\x03\x04", b"PK\x01\x02"
+
+
+def renamed(name: bytes) -> bytes:
+    """An archive with one member of this raw name in both headers."""
+    return zipped(("x" * len(name), b"1")).replace(b"x" * len(name), name)
+
+
+def test_what_is_packed_comes_out_and_the_same_files_give_the_same_bytes():
+    data = _archive.pack(FILES, "doc.kml")
+    assert _archive.unpack(data, Limits()) == FILES
+    assert list(_archive.unpack(data, Limits())) == ["doc.kml", "empty.txt", "images/é.png", "inner.zip"]
+    assert data == _archive.pack(dict(reversed(FILES.items())), "doc.kml")
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        assert archive.testzip() is None
+        assert archive.namelist()[0] == "doc.kml"
+        assert {i.date_time for i in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+
+
+def test_archives_of_other_packers_are_read():
+    pipe = Pipe()
+    with zipfile.ZipFile(pipe, "w", zipfile.ZIP_DEFLATED) as archive:  # sizes in data descriptors
+        archive.writestr("a.txt", b"a" * 1000)
+        archive.mkdir("folder")
+        with archive.open("folder/b.txt", "w", force_zip64=True) as member:
+            member.write(b"b" * 10)
+        archive.comment = b"a comment with PK\x05\x06 in it"
+    assert _archive.unpack(bytes(pipe.body), Limits()) == {"a.txt": b"a" * 1000, "folder/b.txt": b"b" * 10}
+    assert _archive.unpack(zipped(), Limits()) == {}
+
+
+def test_a_name_without_a_flag_is_utf8_from_unix_and_cp437_from_dos():
+    raw = "é.txt".encode()
+    unix = renamed(raw)
+    assert list(_archive.unpack(unix, Limits())) == ["é.txt"]
+    dos = patched(unix, CENTRAL, 5, b"\x00")
+    assert list(_archive.unpack(dos, Limits())) == [raw.decode("cp437")]
+
+
+@pytest.mark.parametrize(
+    ("why", "data"),
+    {
+        "link": with_mode(stat.S_IFLNK | 0o777),
+        "device": with_mode(stat.S_IFCHR | 0o666),
+        "fifo": with_mode(stat.S_IFIFO | 0o666),
+        "folder in disguise": with_mode(stat.S_IFDIR | 0o755),
+        "file called a folder": with_mode(stat.S_IFREG | 0o644, "a/"),
+        "folder with content": zipped(("a/", b"x")),
+        "up": zipped(("../a", b"1")),
+        "up inside": zipped(("a/../../b", b"1")),
+        "dot": zipped(("a/./b", b"1")),
+        "empty folder name": zipped(("a//b", b"1")),
+        "absolute": zipped(("/a", b"1")),
+        "drive": zipped(("c:a", b"1")),
+        "backslash": renamed(b"a\\b"),
+        "control": renamed(b"a\nb"),
+        "escape": renamed(b"a\x1bb"),
+        "nul": renamed(b"a\x00b"),
+        "only a slash": renamed(b"/"),
+        "not utf-8": patched(patched(renamed(b"a\xffb"), LOCAL, 6, b"\x00\x08"), CENTRAL, 8, b"\x00\x08"),
+        "too deep": zipped(("a/" * 70 + "b", b"1")),
+        "too long": zipped(("a" * 1025, b"1")),
+        "case": zipped(("A.txt", b"1"), ("a.TXT", b"2")),
+        "normal form": zipped(("é", b"1"), (unicodedata.normalize("NFD", "é"), b"2")),
+        "file and folder": zipped(("a", b"1"), ("A/b", b"2")),
+        "other name": patched(zipped(("a", b"1")), LOCAL, 30, b"b"),
+        "other method": patched(zipped(("a", b"1" * 99)), LOCAL, 8, b"\x00\x00"),
+        "other flags": patched(zipped(("a", b"1" * 99)), LOCAL, 6, b"\x02\x00"),
+        "other checksum": patched(zipped(("a", b"1" * 99)), LOCAL, 14, b"abcd"),
+        "other size": patched(zipped(("a", b"1" * 99)), LOCAL, 22, struct.pack("<L", 98)),
+        "encrypted": patched(patched(zipped(("a", b"1")), LOCAL, 6, b"\x01"), CENTRAL, 8, b"\x01"),
+        "place of another": patched(zipped(("a", b"1" * 99), ("b", b"1" * 99)), CENTRAL, 42, b"\0\0\0\0", 1),
+    }.items(),
+)
+def test_unsafe_archives_are_refused(why: str, data: bytes):
+    with pytest.raises(UnsafeArchive) as caught:
+        _archive.unpack(data, Limits())
+    assert caught.value.problems, why
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_a_name_twice_is_refused():
+    with pytest.raises(UnsafeArchive, match="another member has too"):
+        _archive.unpack(zipped(("a", b"1"), ("a", b"2")), Limits())
+
+
+def test_members_that_overlap_are_refused():
+    """One member lies inside another one's data: the trick behind bombs that quote themselves."""
+    inner = zipped(("b", b"2" * 10))
+    stored = zipfile.ZipInfo("a")
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr(stored, inner)
+    outer = out.getvalue()
+    at = outer.index(LOCAL, 1)
+    start = outer.rindex(CENTRAL)
+    entry = inner[inner.index(CENTRAL) : inner.index(b"PK\x05\x06")]
+    entry = entry[:42] + struct.pack("<L", at) + entry[46:]
+    directory = outer[start : outer.rindex(b"PK\x05\x06")] + entry
+    end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 2, 2, len(directory), start, 0)
+    with pytest.raises(UnsafeArchive, match="shares its bytes"):
+        _archive.unpack(outer[:start] + directory + end, Limits())
+
+
+def lying(declared: int) -> bytes:
+    """A member of a million zeros that declares another size in both headers."""
+    data = zipped(("a", bytes(1_000_000)))
+    size = struct.pack("<L", declared)
+    return patched(patched(data, LOCAL, 22, size), CENTRAL, 24, size)
+
+
+def test_real_output_is_counted():
+    with pytest.raises(UnsafeArchive, match="more than the 1000 bytes"):
+        _archive.unpack(lying(1000), Limits())
+    with pytest.raises(UnsafeArchive, match="another size"):
+        _archive.unpack(lying(2_000_000), Limits())
+    with pytest.raises(TooLarge):
+        _archive.unpack(lying(0xFFFFFFFE), Limits())
+    with pytest.raises(TooLarge):
+        _archive.unpack(zipped(("a", bytes(1001))), Limits(unpacked_bytes=1000))
+    with pytest.raises(TooLarge, match="members"):
+        _archive.unpack(zipped(("a", b""), ("b", b"")), Limits(files=1))
+
+
+def test_ten_gigabytes_declared_in_a_kilobyte_are_refused_at_once():
+    data = zipped(("a", bytes(1000)))
+    extra = struct.pack("<HHQ", 1, 8, 10 * 2**30)
+    at, end = data.index(CENTRAL), data.index(b"PK\x05\x06")
+    entry = data[at:end]
+    entry = entry[:24] + b"\xff\xff\xff\xff" + entry[28:30] + struct.pack("<H", len(extra)) + entry[32:] + extra
+    tail = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 1, 1, len(entry), at, 0)
+    with pytest.raises(TooLarge, match=str(10 * 2**30)):
+        _archive.unpack(data[:at] + entry + tail, Limits())
+
+
+@pytest.mark.parametrize("kind", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_other_compressions_are_refused_with_a_reason(kind: int):
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", kind) as archive:
+        archive.writestr("a", b"1" * 100)
+    with pytest.raises(UnreadableFile, match="method"):
+        _archive.unpack(out.getvalue(), Limits())
+
+
+def test_a_wrong_checksum_is_damage():
+    data = zipped(("a", b"1" * 99))
+    wrong = struct.pack("<L", zlib.crc32(b"2"))
+    with pytest.raises(UnreadableFile, match="checksum"):
+        _archive.unpack(patched(patched(data, LOCAL, 14, wrong), CENTRAL, 16, wrong), Limits())
+
+
+def test_every_truncation_is_refused():
+    data = _archive.pack(FILES, "doc.kml")
+    for length in range(len(data)):
+        with pytest.raises(BadUpload):
+            _archive.unpack(data[:length], Limits())
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.data())
+def test_no_change_of_bytes_does_anything_but_a_refusal_or_the_same_files(data):
+    body = bytearray(_archive.pack(FILES, "doc.kml"))
+    for _ in range(data.draw(st.integers(1, 4))):
+        body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        out = _archive.unpack(bytes(body), Limits(unpacked_bytes=10**6))
+    except BadUpload:
+        return
+    assert sum(map(len, out.values())) <= 10**6
+    assert all(_archive.bad_name(n) is None for n in out)
+
+
+@pytest.mark.parametrize("name", ["../a", "/a", "a\\b", "a/", "", "a\nb"])
+def test_unusable_names_are_not_packed(name: str):
+    with pytest.raises(ValueError, match="cannot be a name"):
+        _archive.pack({name: b""})
+
+
+def test_large_members_stay_whole():
+    """More than one piece in and out, also where the packed data ends long before its output does."""
+    files = {"zeros": bytes(5_000_000), "noise": bytes(range(256)) * 20_000, "ones": b"1" * (2**20)}
+    assert _archive.unpack(_archive.pack(files), Limits()) == files
+
+
+BUILDERS: list[Callable[[], bytes]] = [lambda: b"", lambda: b"PK", lambda: b"PK\x05\x06" + bytes(17), lambda: b"<kml/>"]
+
+
+@pytest.mark.parametrize("build", BUILDERS)
+def test_what_is_no_archive_is_unreadable(build: Callable[[], bytes]):
+    with pytest.raises(UnreadableFile):
+        _archive.unpack(build(), Limits())
