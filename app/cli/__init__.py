@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -24,6 +24,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sys.exit(run(given))
 
 
+HINTS: Mapping[str, str] = {
+    "MissingDatum": "On the command line: --datum LAT,LON, or a datum.yaml among the files.",
+    "missing-datum": "On the command line: `fleetmap import PATH --environment NAME --datum LAT,LON`.",
+    "Ambiguous": "On the command line: --option grid=NAME.",
+    "ambiguous": "On the command line: --option grid=NAME.",
+}
+"""What to do here, by our own errors' class or the last word of a server's problem type."""
+
+
 def run(arguments: Sequence[str]) -> int:
     """One command: its exit status. Errors are printed to standard error, as JSON with ``--json``."""
     as_json = "--json" in arguments
@@ -34,10 +43,11 @@ def run(arguments: Sequence[str]) -> int:
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     except Refused as refused:
-        output.show_problem(refused.problem, hint=refused.hint, as_json=as_json)
+        kind = str(refused.problem.get("type", "")).rpartition(":")[2]
+        output.show_problem(refused.problem, hint=refused.hint or HINTS.get(kind, ""), as_json=as_json)
         return 1
     except FleetMapError as error:
-        output.show_problem(as_problem(error), as_json=as_json)
+        output.show_problem(as_problem(error), hint=HINTS.get(type(error).__name__, ""), as_json=as_json)
         return 1
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""

@@ -152,27 +152,18 @@ class Client:
         return self._json(self._send("DELETE", path, repeat=True))
 
     def pages(self, path: str, params: Mapping[str, Any], *, limit: int | None = None) -> Iterator[Any]:
-        """All items of a paged list, or the first ``limit`` of them.
-
-        A page names the next one in ``Link: <…>; rel="next"`` or by a ``next`` cursor beside its ``items``.
-        """
-        count, where, query = 0, path, dict(_present(params))
+        """All items of a list, or the first ``limit``; a page names the next one in ``Link: <…>; rel="next"``."""
+        count, where, query = 0, path, _present(params)
         while True:
             answer = self._send("GET", where, params=query, repeat=True)
-            body = answer.json()
-            items = body if isinstance(body, list) else body.get("items", [])
-            for item in items:
+            for item in self._json(answer):
                 if limit is not None and count >= limit:
                     return
                 yield item
                 count += 1
-            cursor = None if isinstance(body, list) else body.get("next") or body.get("cursor")
-            if answer.links.get("next"):
-                where, query = urljoin(str(answer.url), answer.links["next"]["url"]), {}
-            elif cursor and items:
-                query["cursor"] = cursor
-            else:
+            if "next" not in answer.links:
                 return
+            where, query = urljoin(str(answer.url), answer.links["next"]["url"]), {}
 
     # --- files ---
 
@@ -288,8 +279,8 @@ class Client:
 
 
 def path_of(*parts: Any) -> str:
-    """A path below the API from its parts, each quoted (slashes inside a part stay)."""
-    return "/" + "/".join(quote(str(part), safe="/") for part in parts)
+    """A path below the API from its parts, each quoted whole."""
+    return "/" + "/".join(quote(str(part), safe="") for part in parts)
 
 
 def _multipart(files: Sequence[LocalFile], fields: Mapping[str, str], bar: Bar) -> dict[str, Any]:

@@ -96,7 +96,7 @@ def export_map(
     with Client(server, token) as client:
         chosen = version or _preferred(client, environment)
         base = path_of("environments", environment, "versions", chosen)
-        with client.download(base + path_of("maps", format, *([file] if file else [])), params) as got:
+        with client.download(base + path_of("maps", format, *(file.split("/") if file else ())), params) as got:
             written = _store(got, to)
         report = client.get(base + path_of("reports", format), params)
     if as_json:
