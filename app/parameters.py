@@ -88,6 +88,8 @@ def _convert(hint: Any, value: Any) -> Any:
             raise ValueError(f"must be one of {', '.join(map(str, args))}, got {value!r}")
         return value
     if origin is tuple:
+        if not isinstance(value, (str, list, tuple)):
+            raise ValueError(f"must be values separated by commas, got {value!r}")
         parts = value.split(",") if isinstance(value, str) else list(value)
         if len(args) == 2 and args[1] is Ellipsis:
             return tuple(_convert(args[0], p) for p in parts)
@@ -107,20 +109,32 @@ def _convert(hint: Any, value: Any) -> Any:
         if isinstance(value, bool) or (isinstance(value, float) and not value.is_integer()):
             raise ValueError(f"must be a whole number, got {value!r}")
         try:
-            return int(value)
+            whole = int(_digits(value))
         except (TypeError, ValueError):
             raise ValueError(f"must be a whole number, got {value!r}") from None
+        if not -(2**63) <= whole < 2**63:
+            raise ValueError("must be a whole number of at most 64 bit")
+        return whole
     if hint is float:
         try:
-            number = float(value)
-        except (TypeError, ValueError):
+            number = float(_digits(value))
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"must be a number, got {value!r}") from None
         if isinstance(value, bool) or not math.isfinite(number):
             raise ValueError(f"must be a finite number, got {value!r}")
         return number
     if hint is str:
+        if not isinstance(value, (str, int, float)):
+            raise ValueError(f"must be a text, got {value!r}")
         return str(value)
     raise TypeError(f"parameters of type {hint} are not supported")
+
+
+def _digits(value: Any) -> Any:
+    """Texts in ASCII only: Python also takes other scripts' digits and underscores for numbers."""
+    if isinstance(value, str) and (not value.isascii() or "_" in value):
+        raise ValueError("not a number")
+    return value
 
 
 def _check_bounds(value: Any, metadata: Mapping[str, Any]) -> None:

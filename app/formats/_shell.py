@@ -12,6 +12,7 @@ import re
 from collections.abc import Mapping
 
 from app.errors import TooLarge
+from app.model.frame import is_writable
 
 MAX_BYTES = 2**20
 MAX_VARIABLES = 1000
@@ -119,7 +120,7 @@ def _unfit(name: str, value: str, known: Mapping[str, str]) -> str:
     """Why this variable is not handed on, or an empty text."""
     if _DANGEROUS.fullmatch(name):
         return "the variable decides how programs run"
-    if not all(c.isprintable() for c in value):
+    if not is_writable(value):
         return "its value has control characters"
     if len(value) > MAX_VALUE:
         return f"its value has more than {MAX_VALUE} characters"

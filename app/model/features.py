@@ -36,7 +36,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Invalid, MissingDatum, Problem
-from app.model.frame import MAX_METRES, Anchor
+from app.model.frame import MAX_METRES, Anchor, is_writable
 from app.model.geodesy import LocalFrame
 
 Properties = Mapping[str, Any]
@@ -79,12 +79,16 @@ class Features:
             raise ValueError(
                 f"columns differ: {n} ids, {len(self.geometry)} geometries, {len(self.properties)} properties"
             )
+        if self.local.dtype != bool:
+            raise ValueError(f"local must be bool, got {self.local.dtype}")
+        if not bool(shapely.is_geometry(self.geometry).all()):
+            raise ValueError("geometry must hold shapely geometries; NO_GEOMETRY stands for none")
         if len(set(self.ids)) != n:
             twice = next(i for i, seen in _repeats(self.ids) if seen)
             raise Invalid(f"two features of one collection have the id {twice!r}")
         for i in self.ids:
-            if not i or len(i) > MAX_ID or not i.isprintable():
-                bad = [Problem(f"an id must have 1 to {MAX_ID} printable characters", where=repr(i[:80]))]
+            if not i or len(i) > MAX_ID or not is_writable(i):
+                bad = [Problem(f"an id must have 1 to {MAX_ID} characters, no control characters", where=repr(i[:80]))]
                 raise Invalid(f"the id {i[:80]!r} cannot be used", bad)
         _check_coordinates(self)
         self.geometry.flags.writeable = False

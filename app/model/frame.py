@@ -6,6 +6,7 @@ The local frame is x east, y north, z up, in metres, with its origin at the datu
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,6 +22,17 @@ MAX_DATUM_LATITUDE = 85.0
 
 MAX_METRES = 1e7
 """Bound of every local coordinate: far beyond any site, near enough for float64 to keep a nanometre."""
+
+
+_UNWRITABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+
+
+def is_writable(text: str) -> bool:
+    """Whether a name can stand in one line of any format: no control characters, line ends or lone surrogates.
+
+    Zero-width and bidirectional marks and unusual spaces are fine: real names have them.
+    """
+    return text.isprintable() or _UNWRITABLE.search(text) is None
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +80,7 @@ class Level:
     elevation: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.name or len(self.name) > 256 or any(ord(c) < 32 for c in self.name):
+        if not self.name or len(self.name) > 256 or not is_writable(self.name):
             raise Invalid(f"a level's name must have 1 to 256 characters and no control characters, got {self.name!r}")
         if not math.isfinite(self.elevation) or abs(self.elevation) > MAX_METRES:
             raise Invalid(f"level {self.name}: elevation must be a finite number of metres, got {self.elevation!r}")

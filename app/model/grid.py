@@ -51,6 +51,10 @@ class OccupancyGrid:
             value = getattr(self, name)
             if not (math.isfinite(value) and 0.0 <= value <= 1.0):
                 raise Invalid(f"{name} must be between 0 and 1, got {value!r}")
+        # Equal grids are equal bytes in the store, which tells 0 from 0.0 and -0.0.
+        for name in ("resolution", "occupied_thresh", "free_thresh"):
+            object.__setattr__(self, name, float(getattr(self, name)) + 0.0)
+        object.__setattr__(self, "origin", tuple(float(v) + 0.0 for v in self.origin))
         if self.mode not in ("trinary", "scale", "raw"):
             raise Invalid(f"mode must be trinary, scale or raw, got {self.mode!r}")
         if _beyond(self.cells):

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 from app.errors import Invalid
 from app.model.features import Features
-from app.model.frame import GROUND, Datum, Level
+from app.model.frame import GROUND, Datum, Level, is_writable
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
 from app.model.imagery import Picture
@@ -60,8 +60,8 @@ class PartKey:
         if self.layer not in LAYERS:
             raise Invalid(f"no layer is called {self.layer!r}; there are {', '.join(LAYERS)}")
         for what, text in (("level", self.level), ("name", self.name)):
-            if not text or len(text) > 256 or not text.isprintable():
-                raise Invalid(f"a {what} must have 1 to 256 printable characters, got {text[:80]!r}")
+            if not text or len(text) > 256 or not is_writable(text):
+                raise Invalid(f"a {what} must have 1 to 256 characters and no control characters, got {text[:80]!r}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +85,9 @@ class Layers:
     @property
     def layers(self) -> frozenset[Layer]:
         """The layers that have content: a collection without items is no information, whatever its document says."""
-        full = {k.layer for k, p in self.parts.items() if not is_empty(p) and (len(p) if isinstance(p, Features) else 1)}
+        full = {
+            k.layer for k, p in self.parts.items() if not is_empty(p) and (len(p) if isinstance(p, Features) else 1)
+        }
         return frozenset(full | ({"location"} if self.datum else set()))
 
     def of(self, layer: Layer, level: str | None = None, name: str | None = None) -> dict[PartKey, Part]:
