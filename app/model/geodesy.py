@@ -40,24 +40,28 @@ class LocalFrame:
         """(longitude, latitude[, altitude]) in degrees and metres -> (x, y[, z]) in metres.
 
         A third column passes through: heights are stored as given, relative to what their source says.
-        Raises Invalid for a place so far from the datum that the local frame has no coordinates for it.
+        Far round the globe the projection has no answer: such places come out infinite.
         """
         points = np.asarray(lonlat, np.float64)
         out = points.copy()
         east, north = self._proj(points[:, 0], points[:, 1])
-        # Far round the globe the projection has no answer (inf), and metres there would mean nothing.
-        far = ~((np.abs(east) <= MAX_METRES) & (np.abs(north) <= MAX_METRES))
-        if far.any():
-            longitude, latitude = points[np.flatnonzero(far)[0], :2]
-            raise Invalid(
-                f"the place {latitude:g}, {longitude:g} (latitude, longitude) is too far from the datum "
-                f"{self.datum.latitude:g}, {self.datum.longitude:g} for the local frame: correct it or the datum"
-            )
         if self._sin == 0.0 and self._cos == 1.0:
             out[:, 0], out[:, 1] = east, north
         else:
             out[:, 0] = east * self._cos - north * self._sin
             out[:, 1] = east * self._sin + north * self._cos
+        return out
+
+    def _to_near(self, lonlat: Array) -> Array:
+        """``to_local`` for what is kept or written: nothing infinite or beyond the bound of local coordinates."""
+        out = self.to_local(lonlat)
+        far = ~(np.abs(out[:, :2]) <= MAX_METRES).all(axis=1)
+        if far.any():
+            longitude, latitude = lonlat[np.flatnonzero(far)[0], :2]
+            raise Invalid(
+                f"the place {latitude:g}, {longitude:g} (latitude, longitude) is too far from the datum "
+                f"{self.datum.latitude:g}, {self.datum.longitude:g} for the local frame: correct it or the datum"
+            )
         return out
 
     def to_wgs84(self, xy: Array) -> Array:
@@ -79,8 +83,8 @@ class LocalFrame:
         return (90.0 - math.degrees(yaw) + self.datum.heading) % 360.0
 
     def geometries_to_local(self, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
-        """Shapely geometries in degrees -> metres."""
-        return _transform(geometry, self.to_local)
+        """Shapely geometries in degrees -> metres; Invalid where one is too far from the datum for the local frame."""
+        return _transform(geometry, self._to_near)
 
     def geometries_to_wgs84(self, geometry: NDArray[np.object_]) -> NDArray[np.object_]:
         """Shapely geometries in metres -> degrees."""

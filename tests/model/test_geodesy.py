@@ -131,10 +131,13 @@ def test_heights_pass_through_and_inputs_stay() -> None:
 @pytest.mark.parametrize("far", [(100.0, 10.0), (90.0, 0.0), (-179.9, -53.0), (0.0, -90.0)])
 def test_a_place_round_the_globe_is_refused_and_named(far: tuple[float, float]) -> None:
     frame = LocalFrame(Datum(53.0, 0.0))
+    near = shapely.Point(0.0, 53.0)
     with pytest.raises(Invalid, match=f"{far[1]:g}, {far[0]:g}"):
-        frame.to_local(np.array([[0.0, 53.0], far]))
-    with pytest.raises(Invalid, match="too far"):
-        features([("a", shapely.Point(far), {})], "wgs84").in_local(frame)
+        features([("a", near, {}), ("b", shapely.LineString([near, far]), {})], "wgs84").in_local(frame)
+
+
+def test_places_alone_may_come_out_infinite() -> None:
+    assert np.isinf(LocalFrame(Datum(53.0, 0.0)).to_local(np.array([[90.0, 0.0]]))).all()
 
 
 def test_frames_are_kept() -> None:
