@@ -1,0 +1,218 @@
+"""Who may do what: bearer tokens, roles, environments by name pattern, and a brake on guessing.
+
+Default is no: the guard in front of all routes asks for a token at every address that is not listed as open, and for
+the environment that stands in the address; each route declares the role it takes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import ipaddress
+import re
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from fnmatch import fnmatchcase
+from typing import Annotated, Any, Literal
+
+from fastapi import Depends, Request
+
+from app.api.problems import Throttled
+from app.errors import Denied, Unauthenticated
+from app.store.values import Role, Token
+
+Need = Literal["viewer", "editor", "admin"]
+
+_CAN: dict[Need, frozenset[Role]] = {
+    "viewer": frozenset({"viewer", "robot", "editor", "admin"}),
+    "editor": frozenset({"editor", "admin"}),
+    "admin": frozenset({"admin"}),
+}
+
+FRESH_SECONDS = 1.0
+"""How long a token is believed without asking the store: one revoked by another process lives that much longer."""
+
+WINDOW_SECONDS = 60.0
+MAX_KNOWN = 4096
+MAX_SOURCES = 10_000
+MAX_TOKEN = 512
+
+OPEN = frozenset({"/healthz", "/readyz", "/docs", "/openapi.json"})
+"""Addresses that need no token; also all below /docs/ (the pages' own files)."""
+
+_ENVIRONMENT = re.compile(r"/(?:api/v1/environments|maps)/([^/]+)(?:/.*)?", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Principal:
+    """Who asks. environments: a name pattern, None for all."""
+
+    id: str
+    name: str
+    role: Role
+    environments: str | None = None
+    robot: str | None = None
+    expires: datetime | None = None
+
+    @classmethod
+    def of(cls, token: Token) -> Principal:
+        """Who holds this token."""
+        return cls(token.id, token.name, token.role, token.environments, token.robot, token.expires)
+
+    def can(self, need: Need) -> bool:
+        """Whether the role allows it."""
+        return self.role in _CAN[need]
+
+    def may_enter(self, environment: str) -> bool:
+        """Whether the token reaches this environment."""
+        return self.environments is None or fnmatchcase(environment, self.environments)
+
+    def demand(self, need: Need) -> None:
+        """Denied unless the role allows it."""
+        if not self.can(need):
+            takes = " or ".join(sorted(_CAN[need]))
+            raise Denied(f"this call takes a token with the role {takes}; yours is {self.role}")
+
+    def enter(self, environment: str) -> None:
+        """Denied unless the token reaches this environment."""
+        if not self.may_enter(environment):
+            raise Denied(f"your token is limited to the environments {self.environments}")
+
+    def demand_everywhere(self) -> None:
+        """Denied for tokens that are limited to some environments."""
+        if self.environments is not None:
+            raise Denied(f"this call takes a token for all environments; yours is limited to {self.environments}")
+
+
+NOBODY = Principal("", "anonymous", "admin")
+"""Everybody, where access control is switched off."""
+
+
+def is_open(path: str) -> bool:
+    """Whether an address needs no token."""
+    return path in OPEN or path.startswith("/docs/")
+
+
+def environment_of(path: str) -> str | None:
+    """The environment that an address speaks of."""
+    found = _ENVIRONMENT.fullmatch(path)
+    return found[1] if found else None
+
+
+class Access:
+    """Tokens, looked up in the store and believed for a second."""
+
+    def __init__(
+        self,
+        find: Callable[[str], Token | None],
+        *,
+        failures: int,
+        insecure: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._find, self._failures, self._clock = find, failures, clock
+        self.insecure = insecure
+        self._known: OrderedDict[bytes, tuple[Principal, float]] = OrderedDict()
+        self._sources: OrderedDict[str, deque[float]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def known(self, header: bytes | None) -> Principal | None:
+        """Who sent this Authorization header, if it was checked less than a second ago. Never blocks."""
+        if self.insecure:
+            return NOBODY
+        if header is None:
+            return None
+        found = self._known.get(hashlib.sha256(header).digest())
+        return found[0] if found is not None and self._clock() < found[1] else None
+
+    def check(self, header: bytes | None, client: str | None) -> Principal:
+        """Who sent this header. Asks the store, so call it from a thread.
+
+        Raises Unauthenticated, or Throttled where too many wrong tokens came from the client's address.
+        """
+        known = self.known(header)
+        if known is not None:
+            return known
+        source = source_of(client)
+        if self._failed(source) >= self._failures:
+            raise Throttled("too many wrong tokens came from your address: wait a minute and use a valid one")
+        if header is None:
+            raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
+        token = self._find(_token(header)) if _token(header) else None
+        if token is None or (token.expires is not None and token.expires <= datetime.now(UTC)):
+            self._note_failure(source)
+            raise Unauthenticated("the token is unknown or has expired: ask an administrator for a new one")
+        principal = Principal.of(token)
+        with self._lock:
+            self._known[hashlib.sha256(header).digest()] = (principal, self._clock() + FRESH_SECONDS)
+            while len(self._known) > MAX_KNOWN:
+                self._known.popitem(last=False)
+        return principal
+
+    def forget(self) -> None:
+        """Ask the store again for every token: one was revoked."""
+        with self._lock:
+            self._known.clear()
+
+    def _failed(self, source: str) -> int:
+        with self._lock:
+            times = self._sources.get(source)
+            while times and times[0] < self._clock() - WINDOW_SECONDS:
+                times.popleft()
+            return len(times) if times else 0
+
+    def _note_failure(self, source: str) -> None:
+        with self._lock:
+            times = self._sources.setdefault(source, deque(maxlen=self._failures))
+            times.append(self._clock())
+            self._sources.move_to_end(source)
+            while len(self._sources) > MAX_SOURCES:
+                self._sources.popitem(last=False)
+
+
+def _token(header: bytes) -> str:
+    """The token of ``Bearer <token>``; empty where it is none."""
+    scheme, _, text = header.partition(b" ")
+    text = text.strip()
+    if scheme.lower() != b"bearer" or not text or len(text) > MAX_TOKEN:
+        return ""
+    try:
+        return text.decode("ascii")
+    except UnicodeDecodeError:
+        return ""
+
+
+def source_of(client: str | None) -> str:
+    """What counts as one source: an IPv4 address, the /64 of an IPv6 one."""
+    try:
+        address = ipaddress.ip_address(client or "")
+    except ValueError:
+        return client or ""
+    if isinstance(address, ipaddress.IPv6Address):
+        return str(ipaddress.ip_network((int(address) >> 64 << 64, 64)))
+    return str(address)
+
+
+@dataclass(frozen=True, slots=True)
+class AtLeast:
+    """A route's dependency: the caller, who must have at least this role."""
+
+    need: Need
+
+    async def __call__(self, request: Request) -> Principal:
+        """The caller; Denied where the role does not suffice."""
+        principal: Any = request.scope.get("state", {}).get("principal")
+        if not isinstance(principal, Principal):
+            raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
+        principal.demand(self.need)
+        return principal
+
+
+viewer, editor, admin = AtLeast("viewer"), AtLeast("editor"), AtLeast("admin")
+
+Viewer = Annotated[Principal, Depends(viewer)]
+Editor = Annotated[Principal, Depends(editor)]
+Admin = Annotated[Principal, Depends(admin)]

@@ -1,0 +1,77 @@
+"""Answers and requests as this API speaks them: exact JSON in and out, pages with a link to the next one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Any
+from urllib.parse import quote, urlencode
+
+import orjson
+from fastapi import Request
+from fastapi.routing import APIRoute
+from starlette.responses import Response
+
+from app.errors import Invalid, Problem
+
+API = "/api/v1"
+
+
+def path_of(*parts: object) -> str:
+    """An address below the API from its parts, each quoted whole."""
+    return API + "".join("/" + quote(str(part), safe="") for part in parts)
+
+
+def json_bytes(value: Any) -> bytes:
+    """Compact UTF-8 JSON."""
+    return orjson.dumps(value, option=orjson.OPT_NON_STR_KEYS)
+
+
+def answer(value: Any, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
+    """A JSON answer."""
+    return Response(json_bytes(value), status, headers, "application/json")
+
+
+def page(request: Request, items: list[Any], cursor: str | None) -> Response:
+    """One page of a list; ``Link: <…>; rel="next"`` where there is more."""
+    headers = {}
+    if cursor is not None:
+        query = [(k, v) for k, v in request.query_params.multi_items() if k != "cursor"]
+        path = quote(request.url.path, safe="/")
+        headers["link"] = f'<{path}?{urlencode([*query, ("cursor", cursor)])}>; rel="next"'
+    return answer(items, headers=headers)
+
+
+class _Request(Request):
+    async def json(self) -> Any:
+        """The body as JSON: no NaN, no infinity, no lone surrogates, bounded nesting."""
+        return orjson.loads(await self.body())
+
+
+class Route(APIRoute):
+    """A route that reads exact JSON and refuses query parameters it does not know: a misspelt one is told."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """FastAPI's hook."""
+        handler = super().get_route_handler()
+        known = {field.alias for field in _query_fields(self.dependant)}
+        free = bool((self.openapi_extra or {}).get("x-free-query"))
+
+        async def exact(request: Request) -> Response:
+            if not free:
+                unknown = sorted(set(request.query_params) - known)
+                if unknown:
+                    accepted = ", ".join(sorted(known)) or "none"
+                    raise Invalid(
+                        f"unknown query parameter {unknown[0][:80]!r}; accepted: {accepted}",
+                        [Problem(f"unknown; accepted: {accepted}", where=name[:80]) for name in unknown[:20]],
+                    )
+            return await handler(_Request(request.scope, request.receive))
+
+        return exact
+
+
+def _query_fields(dependant: Any) -> list[Any]:
+    out = list(dependant.query_params)
+    for inner in dependant.dependencies:
+        out += _query_fields(inner)
+    return out

@@ -1,0 +1,69 @@
+"""Channels: which version robots drive on, now and from when."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from fastapi import APIRouter
+from starlette.responses import Response
+
+from app.api.access import Editor, Viewer
+from app.api.answers import Route, answer
+from app.api.schemas import ChannelBody, ChannelOut, ChannelPath, EnvironmentPath, told
+from app.api.services import Here
+from app.errors import Invalid, Problem
+from app.store.values import LATEST, Channel, rfc3339
+
+router = APIRouter(prefix="/environments/{env}/channels", tags=["channels"], route_class=Route)
+
+
+def as_dict(channel: Channel) -> dict[str, Any]:
+    """The channel as clients see it."""
+    planned = None
+    if channel.planned is not None:
+        planned = {
+            "version": channel.planned.version,
+            "activate_at": rfc3339(channel.planned.activate_at),
+            "author": channel.planned.author,
+        }
+    return {
+        "channel": channel.name,
+        "version": channel.version,
+        "root": channel.root,
+        "sequence": channel.sequence,
+        "author": channel.author,
+        "time": rfc3339(channel.time),
+        "planned": planned,
+    }
+
+
+@router.get("", responses=told(list[ChannelOut], 404), summary="All channels")
+def list_channels(env: EnvironmentPath, here: Here, _: Viewer) -> Response:
+    """`latest` first, then the others by name, with what is planned for them."""
+    return answer([as_dict(channel) for channel in here.store.channels(env)])
+
+
+@router.put("/{channel}", responses=told(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan it")
+def move_channel(env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, here: Here, who: Editor) -> Response:
+    """To a newer version or back to an older one, now or at a time to come. `latest` moves by itself."""
+    if channel == LATEST:
+        raise Invalid("latest moves by itself: choose another channel", [Problem("not to be moved", where="channel")])
+    if body.activate_at is not None:
+        if body.activate_at.tzinfo is None:
+            raise _refused("activate_at needs a zone, like 2030-01-31T06:00:00Z")
+        if body.activate_at <= datetime.now(UTC):
+            raise _refused("activate_at is in the past: leave it out to move now")
+    version = here.store.version(env, body.version).number
+    return answer(as_dict(here.store.set_channel(env, channel, version, author=who.name, activate_at=body.activate_at)))
+
+
+def _refused(detail: str) -> Invalid:
+    return Invalid(detail, [Problem(detail, where="body.activate_at")])
+
+
+@router.delete("/{channel}/planned", status_code=204, responses=told(None, 404), summary="Cancel what is planned")
+def cancel_planned(env: EnvironmentPath, channel: ChannelPath, here: Here, who: Editor) -> Response:
+    """The channel stays where it is."""
+    here.store.cancel_planned(env, channel, who.name)
+    return Response(status_code=204)

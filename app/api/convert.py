@@ -1,0 +1,143 @@
+"""Convert without storing."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import orjson
+from fastapi import APIRouter, Request
+from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import Response
+
+from app import formats, parameters
+from app.api.access import Editor
+from app.api.answers import Route, answer
+from app.api.caching import content_disposition
+from app.api.environments import datum_of, numbers
+from app.api.problems import UnsupportedMedia
+from app.api.schemas import DatumBody, told
+from app.api.services import Here, Services
+from app.api.uploads import Form
+from app.api.versions import check_names, truth
+from app.bundle import DRAWN_LAYERS, Hints
+from app.convert import Converted
+from app.convert.make import media_type, zipped
+from app.errors import Invalid, Problem
+from app.model.frame import GROUND, Datum, Level
+
+router = APIRouter(tags=["formats"], route_class=Route)
+
+_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["files", "to"],
+                    "properties": {
+                        "files": {"type": "array", "items": {"type": "string", "format": "binary"}},
+                        "to": {"type": "string", "description": "The id of the wanted format."},
+                        "datum": {
+                            "type": "string",
+                            "description": "`LAT,LON` or JSON; else the south-west corner of places on earth.",
+                        },
+                        "format": {"type": "string", "description": "What the files are; left out: by content."},
+                        "layer": {"type": "string", "enum": list(DRAWN_LAYERS)},
+                        "level": {"type": "string", "default": "ground"},
+                        "grid": {"type": "string", "description": "The name of a grid that is read."},
+                        "report": {
+                            "type": "boolean",
+                            "default": False,
+                            "description": "Answer only the report: what would be derived, filled in and dropped.",
+                        },
+                    },
+                    "additionalProperties": {"type": "string", "description": "Options of the wanted format."},
+                },
+                "examples": {"datum": {"value": {"files": ["datum.yaml"], "to": "kml"}}},
+            }
+        },
+    }
+}
+
+
+@router.post(
+    "/convert",
+    response_class=Response,
+    responses={
+        **told(None, 400, 404, 409, 413, 415, 422, 503),
+        200: {
+            "description": "The file, or a zip of several",
+            "content": {"application/octet-stream": {}, "application/zip": {}, "application/json": {}},
+        },
+    },
+    summary="Convert files without storing them",
+    openapi_extra=_BODY,
+)
+async def convert(request: Request, here: Here, _: Editor) -> Response:
+    """The wanted format made of the files in the request. `Fleetmap-Warnings` counts what was doubtful."""
+    media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media != "multipart/form-data":
+        raise UnsupportedMedia("send the files as multipart/form-data")
+    async with here.intake.take(request) as form:
+        return await run_in_threadpool(_convert, here, form)
+
+
+def _convert(here: Services, form: Form) -> Response:
+    fields = dict(form.fields)
+    to = fields.pop("to", "")
+    if not to:
+        raise Invalid("say in the field 'to' which format is wanted", [Problem("missing", where="to")])
+    known = formats.get_format(to)
+    check_names(form.files)
+    layer = fields.pop("layer", "") or None
+    if layer is not None and layer not in DRAWN_LAYERS:
+        raise Invalid(f"layer must be one of {', '.join(DRAWN_LAYERS)}", [Problem("unknown", where="layer")])
+    source = fields.pop("format", "") or None
+    if source is not None:
+        formats.get_format(source)
+    level = fields.pop("level", "") or GROUND
+    Level(level)
+    datum = _datum(fields.pop("datum", ""))
+    only_report = truth(fields.pop("report", ""), "report")
+    grid = fields.pop("grid", "") or None
+    written = {p["name"] for p in parameters.describe(known.write_options)}
+    hints = Hints(source, layer, level, grid, {k: v for k, v in fields.items() if k not in written})
+    values = {k: v for k, v in fields.items() if k in written}
+    done = here.maps.convert({f.name: f.path for f in form.files}, to, hints=hints, datum=datum, options=values)
+    return _answer(done, to, only_report)
+
+
+def _answer(done: Converted, to: str, only_report: bool) -> Response:
+    known = formats.get_format(to)
+    headers = {"fleetmap-warnings": str(len(done.report["warnings"]))}
+    if only_report:
+        files = [
+            {"name": name, "size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+            for name, data in done.files.items()
+        ]
+        return answer({**done.report, "files": files}, headers=headers)
+    if len(done.files) == 1:
+        name, data = next(iter(done.files.items()))
+        kind = media_type(known, name)
+    else:
+        name, data, kind = f"{to}.zip", zipped(done.files), "application/zip"
+    return Response(data, headers={**headers, "content-disposition": content_disposition(name)}, media_type=kind)
+
+
+def _datum(text: str) -> Datum | None:
+    """``LAT,LON`` or a JSON object with latitude and longitude."""
+    if not text:
+        return None
+    if text.lstrip().startswith("{"):
+        try:
+            return datum_of(DatumBody.model_validate(orjson.loads(text)))
+        except (orjson.JSONDecodeError, ValidationError):
+            raise Invalid(
+                'datum must be LAT,LON or {"latitude": …, "longitude": …, "altitude"?, "heading"?} in degrees',
+                [Problem("not a datum", where="datum")],
+            ) from None
+    latitude, longitude = numbers(text, "datum", "LAT,LON")
+    return Datum(latitude, longitude)

@@ -1,0 +1,229 @@
+"""Environments: made, found, described, moved, deleted, restored."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from starlette.responses import Response
+
+from app.api.access import Admin, Editor, Principal, Viewer
+from app.api.answers import Route, answer, page, path_of
+from app.api.schemas import (
+    RESERVED,
+    Cursor,
+    DatumBody,
+    EnvironmentBody,
+    EnvironmentOut,
+    EnvironmentPatch,
+    EnvironmentPath,
+    IfMatch,
+    Limit,
+    told,
+)
+from app.api.services import Here, Services
+from app.errors import Conflict, Gone, Invalid, NotFound, Problem
+from app.ingest.service import check_if_match
+from app.model.frame import Datum
+from app.store.values import Box, Environment, rfc3339
+
+router = APIRouter(prefix="/environments", tags=["environments"], route_class=Route)
+
+
+def as_dict(environment: Environment) -> dict[str, Any]:
+    """The environment as clients see it."""
+    return {
+        "name": environment.name,
+        "title": environment.title,
+        "description": environment.description,
+        "tags": list(environment.tags),
+        "version": environment.head,
+        "root": environment.root,
+        "datum": environment.datum.as_dict() if environment.datum else None,
+        "bounds": list(environment.bounds) if environment.bounds else None,
+        "created": rfc3339(environment.created),
+        "updated": rfc3339(environment.updated),
+        "deleted": rfc3339(environment.deleted) if environment.deleted else None,
+    }
+
+
+def numbers(text: str, what: str, names: str) -> tuple[float, ...]:
+    """Numbers separated by commas; Invalid unless there is one for each of ``names`` (``LAT,LON``)."""
+    count = names.count(",") + 1
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(abs(v) <= 1e9 for v in values):
+        raise Invalid(f"{what} must be {names}: {count} numbers separated by commas", [Problem(names, where=what)])
+    return values
+
+
+def box_of(text: str, what: str = "bbox") -> Box:
+    """West, south, east, north in degrees; west > east crosses the antimeridian."""
+    west, south, east, north = numbers(text, what, "W,S,E,N")
+    if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
+        raise Invalid(
+            f"{what} must be west, south, east, north in degrees, with south ≤ north", [Problem("W,S,E,N", where=what)]
+        )
+    return west, south, east, north
+
+
+def datum_of(body: DatumBody) -> Datum:
+    """The datum of a request."""
+    return Datum(body.latitude, body.longitude, body.altitude, body.heading)
+
+
+def _headers(environment: Environment) -> dict[str, str]:
+    return {"etag": f'"{environment.head}"'}
+
+
+@router.get("", responses=told(list[EnvironmentOut]), summary="List environments")
+def list_environments(
+    request: Request,
+    here: Here,
+    who: Viewer,
+    q: Annotated[
+        str | None, Query(max_length=200, description="Text in name, title, description or tags.", examples=["farm"])
+    ] = None,
+    contains: Annotated[
+        str | None,
+        Query(
+            description="`LAT,LON`: environments around this place (which map am I on?).", examples=["53.2687,-0.5244"]
+        ),
+    ] = None,
+    bbox: Annotated[
+        str | None, Query(description="`W,S,E,N` in degrees: environments that meet this box.", examples=["-1,53,0,54"])
+    ] = None,
+    deleted: Annotated[bool, Query(description="Those that wait for being restored or purged.")] = False,
+    limit: Limit = 100,
+    cursor: Cursor = None,
+) -> Response:
+    """Environments by name, those that the token reaches."""
+    place = None
+    if contains is not None:
+        latitude, longitude = numbers(contains, "contains", "LAT,LON")
+        if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
+            raise Invalid(
+                "contains must be LAT,LON in degrees: the latitude comes first", [Problem("LAT,LON", where="contains")]
+            )
+        place = (latitude, longitude)
+    items, following = here.store.environments(
+        q=q or None,
+        contains=place,
+        bbox=box_of(bbox) if bbox is not None else None,
+        limit=limit,
+        cursor=cursor,
+        allowed=who.environments,
+        deleted=deleted,
+    )
+    return page(request, [as_dict(e) for e in items], following)
+
+
+@router.post(
+    "",
+    status_code=201,
+    responses=told(EnvironmentOut, 400, 409, 415, ok=201, description="Made"),
+    summary="Make an environment",
+)
+def create_environment(body: EnvironmentBody, here: Here, who: Admin) -> Response:
+    """Empty (version 0), with a datum (version 1), or with the content of another one (version 1)."""
+    who.enter(body.name)
+    _check_name(body.name)
+    clone = None
+    if body.clone is not None:
+        if body.datum is not None:
+            raise Invalid("a clone has the datum of what it is cloned from: give datum or clone, and PATCH it later")
+        who.enter(body.clone.environment)
+        clone = here.store.version(body.clone.environment, body.clone.version)
+    made = here.store.create_environment(
+        body.name,
+        title=body.title,
+        description=body.description,
+        tags=tuple(body.tags),
+        author=who.name,
+        datum=datum_of(body.datum) if body.datum else None,
+        clone=clone,
+    )
+    return answer(as_dict(made), 201, {"location": path_of("environments", made.name), **_headers(made)})
+
+
+@router.get("/{env}", responses=told(EnvironmentOut, 404), summary="One environment")
+def get_environment(env: EnvironmentPath, here: Here, _: Viewer) -> Response:
+    """The environment as it is now; its `ETag` is the head's number, for `If-Match`."""
+    found = here.store.environment(env)
+    return answer(as_dict(found), headers=_headers(found))
+
+
+@router.patch(
+    "/{env}", responses=told(EnvironmentOut, 400, 404, 409, 412, 415), summary="Describe, rename, or set the datum"
+)
+def update_environment(
+    env: EnvironmentPath, body: EnvironmentPatch, here: Here, who: Editor, if_match: IfMatch = None
+) -> Response:
+    """What is left out stays. A new datum makes a version and takes an editor; all else takes an administrator."""
+    given = body.model_dump(exclude_none=True)
+    if not given:
+        raise Invalid("there is nothing to change: give at least one of name, title, description, tags, datum")
+    if set(given) != {"datum"}:
+        who.demand("admin")
+    if if_match is not None:
+        check_if_match(if_match, here.store.version(env))
+    if body.name is not None and body.name != env:
+        _check_free(here, body.name, who)
+    warnings: list[Any] = []
+    if body.datum is not None:
+        outcome = here.ingest.set_datum(env, datum_of(body.datum), author=who.name, if_match=if_match)
+        warnings = outcome.body.get("warnings", []) if outcome.status == "created" else []
+    if set(given) != {"datum"}:
+        found = here.store.update_environment(
+            env,
+            new_name=body.name if body.name != env else None,
+            title=body.title,
+            description=body.description,
+            tags=tuple(body.tags) if body.tags is not None else None,
+            author=who.name,
+        )
+    else:
+        found = here.store.environment(env)
+    headers = {**_headers(found), "content-location": path_of("environments", found.name)}
+    return answer({**as_dict(found), **({"warnings": warnings} if warnings else {})}, headers=headers)
+
+
+@router.delete("/{env}", status_code=204, responses=told(None, 404), summary="Delete an environment")
+def delete_environment(env: EnvironmentPath, here: Here, who: Admin) -> Response:
+    """It can be restored until it is purged; its name stays taken until then."""
+    here.store.delete_environment(env, who.name)
+    return Response(status_code=204)
+
+
+@router.post("/{env}/restore", responses=told(EnvironmentOut, 404, 409), summary="Undo a deletion")
+def restore_environment(env: EnvironmentPath, here: Here, who: Admin) -> Response:
+    """A deleted environment comes back with all its versions and channels."""
+    found = here.store.restore_environment(env, who.name)
+    return answer(as_dict(found), headers=_headers(found))
+
+
+@router.post("/{env}/purge", status_code=204, responses=told(None, 404, 409), summary="Remove for good")
+def purge_environment(env: EnvironmentPath, here: Here, _: Admin) -> Response:
+    """Removes a deleted environment with all its versions for good; only then its name is free again."""
+    here.store.purge_environment(env)
+    return Response(status_code=204)
+
+
+def _check_name(name: str) -> None:
+    if name in RESERVED:
+        raise Invalid(f"the name {name!r} is reserved: choose another", [Problem("reserved", where="body.name")])
+
+
+def _check_free(here: Services, name: str, who: Principal) -> None:
+    """Before anything else of a PATCH is done: the new name can be had."""
+    who.enter(name)
+    _check_name(name)
+    try:
+        here.store.environment(name, deleted=True)
+    except Gone:
+        pass
+    except NotFound:
+        return
+    raise Conflict(f"there is an environment {name!r} already, or a deleted one that is not yet purged")

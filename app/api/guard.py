@@ -1,0 +1,275 @@
+"""In front of all routes: the token, the size and pace of bodies, and every error in one shape.
+
+Plain ASGI: it costs a few microseconds and lets bodies stream.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from typing import Any
+from urllib.parse import urlsplit
+
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from app.api import problems
+from app.api.access import environment_of, is_open
+from app.api.problems import MalformedBody, SlowBody, UnsupportedMedia
+from app.api.services import Services
+from app.errors import Denied, FleetMapError, TooLarge
+
+MULTIPART_OVERHEAD = 2**20
+"""Bytes that a multipart body may have beside its files: field values, plus the parts' heads."""
+
+PART_OVERHEAD = 1024
+MIN_PACE = 1024
+"""Bytes a second that a client must send on the whole."""
+
+DRAIN_BYTES = 32 * 2**20
+DRAIN_SECONDS = 5.0
+"""How much of a refused body is still taken in, so that the client reads the answer before it sees a closed door."""
+
+_BODY = frozenset({"POST", "PUT", "PATCH"})
+_METHODS = frozenset({"GET", "DELETE", "OPTIONS", *_BODY})
+_LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
+
+
+class _Disconnected(Exception):
+    """The client went away in the middle of its body."""
+
+
+class Guard:
+    """ASGI middleware; ``app.state.services`` is looked up with each request."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or pass it on."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        here: Services = scope["app"].state.services
+        started = time.perf_counter()
+        head_only = scope["method"] == "HEAD"
+        if head_only:
+            # A HEAD is a GET whose body stays here; routes that answer HEAD themselves are told by the state.
+            scope = {**scope, "method": "GET", "state": {**scope.get("state", {}), "head": True}}
+        answer = _Answer(send, head_only)
+        body = _Body(receive, here)
+        try:
+            await self._pass(scope, body, answer, here)
+        except _Disconnected:
+            return
+        except FleetMapError as error:
+            await self._refuse(problems.of_error(error), scope, body, answer)
+        except HTTPException as error:
+            await self._refuse(problems.of_http(error), scope, body, answer)
+        except asyncio.CancelledError:
+            raise
+        except Exception as error:  # noqa: BLE001  the last place where a bug can become a 500 with a shape
+            await self._refuse(problems.of_bug(error), scope, body, answer)
+        finally:
+            route = getattr(scope.get("route"), "path", "other")
+            method = scope["method"] if scope["method"] in _METHODS else "other"
+            here.metrics.requests.labels(method, route, str(answer.status)).inc()
+            here.metrics.seconds.labels(route).observe(time.perf_counter() - started)
+
+    async def _pass(self, scope: Scope, body: _Body, answer: _Answer, here: Services) -> None:
+        headers = _headers(scope)
+        if here.options.insecure_no_auth:
+            only_from_here(headers)
+        if not is_open(scope["path"]):
+            authorization = headers.get(b"authorization")
+            principal = here.access.known(authorization)
+            if principal is None:
+                client = scope["client"][0] if scope.get("client") else None
+                principal = await run_in_threadpool(here.access.check, authorization, client)
+            environment = environment_of(scope["path"])
+            if environment is not None:
+                principal.enter(environment)
+            scope.setdefault("state", {})["principal"] = principal
+        if scope["method"] in _BODY and body.begin(scope, headers):
+            await body.preload()
+        await self._app(scope, body, answer)
+
+    async def _refuse(self, response: Any, scope: Scope, body: _Body, answer: _Answer) -> None:
+        if answer.started:
+            # Half an answer is out: the only honest end is a broken connection.
+            raise ConnectionAbortedError("the answer could not be finished")
+        if not await body.drain():
+            response.headers["connection"] = "close"
+        await response(scope, body, answer)
+
+
+def _headers(scope: Scope) -> dict[bytes, bytes]:
+    return dict(scope["headers"])
+
+
+def only_from_here(headers: dict[bytes, bytes]) -> None:
+    """Without tokens a browser must not be led here by a foreign page (DNS rebinding, cross-site requests)."""
+    host = urlsplit("//" + headers.get(b"host", b"").decode("latin-1")).hostname
+    if host not in _LOOPBACK:
+        raise Denied("without access control the server answers only to a loopback name (localhost, 127.0.0.1)")
+    origin = headers.get(b"origin")
+    if origin is not None and urlsplit(origin.decode("latin-1")).hostname not in _LOOPBACK:
+        raise Denied("without access control the server answers no other site's pages")
+
+
+class _Answer:
+    """Sends, and remembers the status; adds ``nosniff``; leaves out the body of a HEAD."""
+
+    __slots__ = ("_head_only", "_send", "started", "status")
+
+    def __init__(self, send: Send, head_only: bool) -> None:
+        self._send, self._head_only = send, head_only
+        self.started, self.status = False, 0
+
+    async def __call__(self, message: Message) -> None:
+        if message["type"] == "http.response.start":
+            self.started, self.status = True, message["status"]
+            headers = list(message.get("headers", ()))
+            names = {name for name, _ in headers}
+            if b"x-content-type-options" not in names:
+                headers.append((b"x-content-type-options", b"nosniff"))
+            if b"cache-control" not in names:
+                headers.append((b"cache-control", b"no-cache"))
+            message = {**message, "headers": headers}
+        elif self._head_only and message["type"] == "http.response.body":
+            if message.get("more_body", False):
+                return
+            message = {"type": "http.response.body", "body": b"", "more_body": False}
+        await self._send(message)
+
+
+class _Body:
+    """Receives, counts, and keeps the time."""
+
+    __slots__ = (
+        "_begun",
+        "_declared",
+        "_expects",
+        "_here",
+        "_limit",
+        "_loaded",
+        "_receive",
+        "_received",
+        "_whole",
+        "what",
+    )
+
+    def __init__(self, receive: Receive, here: Services) -> None:
+        self._receive, self._here = receive, here
+        self._limit = here.options.max_json_bytes
+        self._received, self._begun, self._whole = 0, time.monotonic(), False
+        self._declared: int | None = 0
+        self._expects = False
+        self._loaded: Message | None = None
+        self.what = "request body"
+
+    def begin(self, scope: Scope, headers: dict[bytes, bytes]) -> bool:
+        """Look at what is announced (coding, media type, length): whether the body is one to be read as a whole."""
+        self._expects = headers.get(b"expect", b"").lower() == b"100-continue"
+        coding = headers.get(b"content-encoding", b"identity").strip().lower()
+        length = headers.get(b"content-length")
+        self._declared = int(length) if length is not None and length.isdigit() else None
+        if length is None and b"transfer-encoding" not in headers:
+            self._declared = 0
+        if coding not in (b"", b"identity"):
+            raise UnsupportedMedia(
+                f"bodies are taken as they are, not with Content-Encoding {coding.decode('latin-1')[:40]}: "
+                "send the plain bytes (an archive may be sent as a .zip file)"
+            )
+        if self._declared == 0:
+            return False
+        media = headers.get(b"content-type", b"").partition(b";")[0].strip().lower().decode("latin-1")
+        upload = takes_files(scope["path"])
+        if media == "multipart/form-data" and upload:
+            limits = self._here.options.limits
+            self.what = "upload"
+            # Heads of parts are counted where they are read; this bound only has to be safe.
+            parts = min(limits.files, 100_000)
+            self._limit = limits.upload_bytes + MULTIPART_OVERHEAD + parts * PART_OVERHEAD
+        elif not (media == "application/json" or (media.startswith("application/") and media.endswith("+json"))):
+            takes = "multipart/form-data or application/json" if upload else "application/json"
+            raise UnsupportedMedia(f"this call takes {takes}, not {media[:80] or 'a body without Content-Type'}")
+        if self._declared is not None and self._declared > self._limit:
+            raise self._too_large()
+        return self.what != "upload"
+
+    async def preload(self) -> None:
+        """Read the whole body now: its errors are told from here, before any route parses half of it."""
+        chunks = []
+        while not self._whole:
+            chunks.append((await self()).get("body", b""))
+        self._loaded = {"type": "http.request", "body": b"".join(chunks), "more_body": False}
+
+    async def __call__(self) -> Message:
+        if self._loaded is not None:
+            message, self._loaded = self._loaded, None
+            return message
+        if self._declared == 0 or self._whole:
+            return await self._receive()
+        pace = self._here.options.body_seconds
+        late = self._begun + pace + self._received / MIN_PACE - time.monotonic()
+        try:
+            async with asyncio.timeout(min(pace, max(0.001, late))):
+                message = await self._receive()
+        except TimeoutError:
+            raise SlowBody(
+                f"the {self.what} stopped coming, or comes at less than {MIN_PACE} bytes a second: send it again"
+            ) from None
+        if message["type"] == "http.disconnect":
+            raise _Disconnected
+        self._received += len(message.get("body", b""))
+        self._whole = not message.get("more_body", False)
+        if self._received > self._limit:
+            raise self._too_large()
+        return message
+
+    def _too_large(self) -> TooLarge:
+        return TooLarge(f"the {self.what} is larger than {self._limit} bytes, the most that this server takes")
+
+    async def drain(self) -> bool:
+        """Take in the rest of a refused body, within reason: whether all of it came."""
+        if self._whole or self._declared == 0:
+            return True
+        if self._expects and self._received == 0:
+            return False  # it has not been sent yet, and now never will
+        if self._declared is not None and self._declared - self._received > DRAIN_BYTES:
+            budget = DRAIN_BYTES // 8
+        else:
+            budget = DRAIN_BYTES
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(DRAIN_SECONDS):
+                while budget > 0:
+                    message = await self._receive()
+                    if message["type"] == "http.disconnect":
+                        return False
+                    budget -= len(message.get("body", b""))
+                    if not message.get("more_body", False):
+                        self._whole = True
+                        return True
+        return False
+
+
+def takes_files(path: str) -> bool:
+    """Whether files can be uploaded at this address."""
+    parts = path.split("/")
+    if path == "/api/v1/convert":
+        return True
+    return len(parts) == 6 and parts[:4] == ["", "api", "v1", "environments"] and parts[5] == "versions"
+
+
+def multipart_boundary(content_type: str) -> bytes:
+    """The boundary of a multipart body; MalformedBody where there is none."""
+    from python_multipart.multipart import parse_options_header
+
+    _, options = parse_options_header(content_type)
+    boundary = options.get(b"boundary", b"")
+    if not 1 <= len(boundary) <= 200:
+        raise MalformedBody("the multipart body's Content-Type has no usable boundary")
+    return boundary

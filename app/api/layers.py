@@ -1,0 +1,452 @@
+"""Canonical content (contract, section 8): vector layers as GeoJSON, grids and pictures as PNG, or JSON about them."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import orjson
+import shapely
+from fastapi import APIRouter, Query, Request
+from numpy.typing import NDArray
+from PIL import Image
+from starlette.responses import Response
+
+from app import formats
+from app.api.access import Viewer
+from app.api.answers import Route, answer, json_bytes
+from app.api.caching import none_match
+from app.api.environments import box_of, numbers
+from app.api.maps import number_of
+from app.api.problems import NotAcceptable
+from app.api.schemas import EnvironmentPath, LayerOut, LayerPath, VersionPath, told
+from app.api.services import Here, Services
+from app.errors import Ambiguous, Invalid, MissingDatum, NotFound, Problem
+from app.formats import WriteContext
+from app.model.features import Features
+from app.model.frame import MAX_METRES, Anchor
+from app.model.geodesy import LocalFrame, local_frame
+from app.model.grid import OccupancyGrid
+from app.model.imagery import Picture
+from app.model.layers import MAP, VECTOR_LAYERS, Layer, Layers, PartKey
+from app.model.voxels import DEPTH, VoxelMap
+from app.store.values import Box, PartEntry, Version
+
+router = APIRouter(prefix="/environments/{env}/versions/{v}/layers", tags=["layers"], route_class=Route)
+
+LOCAL_CRS = "urn:fleetmap:crs:local"
+"""The local frame's name in JSON-FG's ``coordRefSys``; where it lies stands in the member ``datum``."""
+
+CONFORMS = ["http://www.opengis.net/spec/json-fg-1/1.0/conf/core"]
+GEOJSON = "application/geo+json"
+
+Crs = Annotated[
+    Literal["local", "wgs84"] | None,
+    Query(description="`wgs84`: longitude, latitude. `local`: metres. Default: wgs84 where there is a datum."),
+]
+
+
+def entry_dict(entry: PartEntry) -> dict[str, Any]:
+    """A part as the list of layers shows it."""
+    bounds = {name: list(box) if box else None for name, box in (entry.bounds or {}).items()}
+    p = entry.provenance
+    return {
+        "layer": entry.key.layer,
+        "level": entry.key.level,
+        "name": entry.key.name,
+        "count": entry.count,
+        "hash": entry.hash,
+        "bounds": bounds,
+        "information": p.information,
+        "format": p.format,
+        "sources": list(p.sources),
+        "attribution": list(p.attribution),
+    }
+
+
+@router.get("", responses=told(list[LayerOut], 404), summary="What a version holds")
+def list_layers(env: EnvironmentPath, v: VersionPath, here: Here, _: Viewer) -> Response:
+    """Every part: layer, level and name, how much it holds, where, and where it comes from."""
+    version = here.store.version(env, number_of(v))
+    return answer([entry_dict(entry) for entry in version.parts if entry.key.layer != "resources"])
+
+
+@router.get(
+    "/{layer}",
+    response_class=Response,
+    responses={
+        **told(None, 404, 406, 409, 422),
+        200: {
+            "description": "The content",
+            "content": {
+                GEOJSON: {"schema": {"type": "object"}},
+                "image/png": {},
+                "application/json": {"schema": {"type": "object"}},
+                "application/octet-stream": {},
+            },
+        },
+        304: {"description": "The client has it"},
+    },
+    summary="A layer's content",
+)
+def get_layer(
+    env: EnvironmentPath,
+    v: VersionPath,
+    layer: LayerPath,
+    request: Request,
+    here: Here,
+    _: Viewer,
+    level: Annotated[str | None, Query(max_length=256, description="Of this storey only.")] = None,
+    name: Annotated[str | None, Query(max_length=256, description="The part's name: a grid's, a network's …")] = None,
+    bbox: Annotated[str | None, Query(description="Only what meets this box, in the same `crs`.")] = None,
+    crs: Crs = None,
+) -> Response:
+    """Vector layers are GeoJSON; in the local frame they are JSON-FG, with metres under `place`, never as lon/lat.
+
+    `occupancy` and `imagery` are PNG, or JSON with `Accept: application/json`; `voxels` are JSON, or the `.bt` with
+    `Accept: application/octet-stream`.
+    """
+    version = here.store.version(env, number_of(v))
+    accept = request.headers.get("accept", "*/*")
+    seed = [version.root, layer, level, name, bbox, crs, accept]
+    etag = f'"{hashlib.sha256(json_bytes(seed)).hexdigest()[:32]}"'
+    headers = {
+        "etag": etag,
+        "vary": "accept",
+        "fleetmap-version": str(version.number),
+        "fleetmap-root": version.root,
+    }
+    if none_match(request.headers.get("if-none-match"), etag):
+        return Response(status_code=304, headers=headers)
+    if layer in VECTOR_LAYERS:
+        wanted: Anchor = crs or ("wgs84" if version.datum else "local")
+        response = _vector(here, version, layer, level, name, _box(bbox, wanted), wanted, accept)
+    else:
+        if crs == "wgs84" and version.datum is None:
+            raise _no_datum(env)
+        key = _one(version, layer, level, name)
+        part = here.store.load(version, [key]).parts[key]
+        if isinstance(part, OccupancyGrid):
+            box = _local_box(version, bbox, crs)
+            response = _grid(key, part, box, accept)
+        elif bbox is not None:
+            raise Invalid(f"{layer} cannot be cut to a bbox", [Problem("not for this layer", where="bbox")])
+        elif isinstance(part, VoxelMap):
+            response = _voxels(key, part, version, accept)
+        else:
+            assert isinstance(part, Picture)
+            response = _picture(key, part, accept)
+    for header, value in headers.items():
+        response.headers[header] = value
+    return response
+
+
+# --- vector layers ---
+
+
+def _vector(
+    here: Services,
+    version: Version,
+    layer: Layer,
+    level: str | None,
+    name: str | None,
+    box: Box | None,
+    crs: Anchor,
+    accept: str,
+) -> Response:
+    _choose(accept, GEOJSON, "application/json")
+    keys = _fitting(version, layer, level, name)
+    if not keys and (level is not None or name is not None):
+        raise _none(version, layer, level, name)
+    frame = local_frame(version.datum) if version.datum else None
+    parts = [(key, here.store.features(version, key, bbox=box, crs=crs)) for key in keys]
+    if frame is None and any(len(part) and bool((part.local != (crs == "local")).any()) for _, part in parts):
+        raise _no_datum(version.environment)
+    collection = feature_collection(parts, crs, frame, version)
+    return Response(collection, media_type=GEOJSON)
+
+
+def feature_collection(
+    parts: Sequence[tuple[PartKey, Features]], crs: Anchor, frame: LocalFrame | None, version: Version
+) -> bytes:
+    """GeoJSON (wgs84) or JSON-FG (local) of some parts; each feature says its level and its part's name.
+
+    Coordinates are rounded to 1e-12 degrees and 1e-9 metres.
+    """
+    features: list[dict[str, Any]] = []
+    local = crs == "local"
+    datum = version.datum.as_dict() if version.datum else None
+    for key, part in parts:
+        geometry = part.in_local(frame) if local else part.in_wgs84(frame)
+        shapes = geojson_of(geometry, 9 if local else 12)
+        for k, (item, properties) in enumerate(zip(part.ids, part.properties, strict=True)):
+            feature: dict[str, Any] = {"type": "Feature", "id": item}
+            if local:
+                feature["geometry"], feature["place"] = None, shapes[k]
+            else:
+                feature["geometry"] = shapes[k]
+            if key.layer == "location" and datum is not None:
+                properties = {**properties, "datum": datum}  # noqa: PLW2901
+            feature |= {"properties": properties, "level": key.level, "part": key.name}
+            features.append(feature)
+    if not features and datum is not None and _is_location(parts, version):
+        point = [0.0, 0.0] if local else [datum["longitude"], datum["latitude"]]
+        shape = {"type": "Point", "coordinates": point}
+        placed = {"geometry": None, "place": shape} if local else {"geometry": shape}
+        properties = {"kind": "datum", "datum": datum}
+        features.append({"type": "Feature", "id": "datum", **placed, "properties": properties, "level": "ground"})
+    out: dict[str, Any] = {"type": "FeatureCollection"}
+    if local:
+        out |= {"conformsTo": CONFORMS, "coordRefSys": LOCAL_CRS, "datum": datum}
+    return json_bytes({**out, "features": features})
+
+
+def _is_location(parts: Sequence[tuple[PartKey, Features]], version: Version) -> bool:
+    return all(key.layer == "location" for key, _ in parts) and bool(
+        parts or not any(e.key.layer == "location" for e in version.parts)
+    )
+
+
+def geojson_of(geometry: NDArray[np.object_], digits: int) -> list[orjson.Fragment | None]:
+    """Each geometry as GeoJSON, rounded; None for those without coordinates."""
+    if not len(geometry):
+        return []
+    flat = ~shapely.has_z(geometry)
+    rounded = np.empty(len(geometry), object)
+
+    def round_(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.round(values, digits) + 0.0
+
+    for mask, include_z in ((flat, False), (~flat, True)):
+        if mask.any():
+            rounded[mask] = shapely.transform(geometry[mask], round_, include_z=include_z)
+    empty = shapely.is_empty(rounded)
+    texts = shapely.to_geojson(rounded)
+    return [None if none else orjson.Fragment(text) for none, text in zip(empty, texts, strict=True)]
+
+
+# --- grids, voxels, pictures ---
+
+
+def _grid(key: PartKey, grid: OccupancyGrid, box: Box | None, accept: str) -> Response:
+    kind = _choose(accept, "image/png", "application/json")
+    if box is not None:
+        grid = cut(grid, box)
+    if kind == "image/png":
+        return Response(png(np.flipud(grid.cells)), media_type=kind)
+    return answer(
+        {
+            "name": key.name,
+            "level": key.level,
+            "width": grid.width,
+            "height": grid.height,
+            "resolution": grid.resolution,
+            "origin": list(grid.origin),
+            "counts": grid.counts(),
+        }
+    )
+
+
+def cut(grid: OccupancyGrid, box: Box) -> OccupancyGrid:
+    """The smallest part of a grid that holds all its cells meeting a local box; Invalid where there are none."""
+    x, y, yaw = grid.origin
+    c, s = math.cos(yaw), math.sin(yaw)
+    west, south, east, north = box
+    corners = [(px - x, py - y) for px in (west, east) for py in (south, north)]
+    u = [(c * px + s * py) / grid.resolution for px, py in corners]
+    v = [(c * py - s * px) / grid.resolution for px, py in corners]
+    left, right = max(0, math.floor(min(u))), min(grid.width, math.ceil(max(u)))
+    low, high = max(0, math.floor(min(v))), min(grid.height, math.ceil(max(v)))
+    if left >= right or low >= high:
+        raise NotFound("the bbox lies outside of the grid")
+    du, dv = left * grid.resolution, low * grid.resolution
+    origin = (x + c * du - s * dv, y + s * du + c * dv, yaw)
+    return replace(grid, cells=grid.cells[low:high, left:right].copy(), origin=origin)
+
+
+def png(pixels: NDArray[Any]) -> bytes:
+    """Pixels [height, width] or [height, width, 1…4] as PNG; quick rather than small."""
+    if pixels.ndim == 3 and pixels.shape[2] == 1:
+        pixels = pixels[:, :, 0]
+    modes = {2: "LA", 3: "RGB", 4: "RGBA"}
+    mode = modes[pixels.shape[2]] if pixels.ndim == 3 else "L"
+    height, width = pixels.shape[:2]
+    image = Image.frombytes(mode, (width, height), np.ascontiguousarray(pixels).tobytes())
+    out = io.BytesIO()
+    image.save(out, "PNG", compress_level=1)
+    return out.getvalue()
+
+
+def _voxels(key: PartKey, voxels: VoxelMap, version: Version, accept: str) -> Response:
+    kind = _choose(accept, "application/json", "application/octet-stream")
+    if kind == "application/octet-stream":
+        known = formats.all_formats().get("octomap")
+        if known is None or known.write is None:
+            raise NotAcceptable("this server cannot write OctoMap files yet: ask for application/json")
+        layers = Layers({key: voxels}, version.datum, version.levels)
+        files = formats.write(known, layers, WriteContext())
+        return Response(next(iter(files.values())), media_type=kind)
+    occupied = int((voxels.log_odds >= 0).sum())
+    return answer(
+        {
+            "name": key.name,
+            "level": key.level,
+            "resolution": voxels.resolution,
+            "depth": DEPTH,
+            "counts": {"occupied": occupied, "free": len(voxels.depth) - occupied},
+            "bounds": voxel_bounds(voxels),
+        }
+    )
+
+
+def voxel_bounds(voxels: VoxelMap) -> list[float] | None:
+    """[min x, min y, min z, max x, max y, max z] in metres around all leaves."""
+    if not len(voxels.depth):
+        return None
+    size = np.left_shift(np.int64(1), (DEPTH - voxels.depth).astype(np.int64))
+    low, high = [], []
+    for axis in range(3):
+        start = _even_bits(voxels.code >> np.uint64(axis)).astype(np.int64) * size - 2 ** (DEPTH - 1)
+        low.append(float(start.min()) * voxels.resolution)
+        high.append(float((start + size).max()) * voxels.resolution)
+    return [*low, *high]
+
+
+def _even_bits(code: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Every third bit, from the lowest, moved together: one axis of a 3-D Morton code of up to 16 bits an axis."""
+    out = np.zeros_like(code)
+    for bit in range(DEPTH):
+        out |= ((code >> np.uint64(3 * bit)) & np.uint64(1)) << np.uint64(bit)
+    return out
+
+
+def _picture(key: PartKey, picture: Picture, accept: str) -> Response:
+    kind = _choose(accept, "image/png", "application/json")
+    height, width, bands = picture.pixels.shape
+    if kind == "application/json":
+        return answer(
+            {
+                "name": key.name,
+                "level": key.level,
+                "width": width,
+                "height": height,
+                "bands": bands,
+                "transform": list(picture.transform),
+                "crs": picture.crs,
+            }
+        )
+    if picture.pixels.dtype != np.uint8 or bands > 4:
+        raise NotAcceptable(
+            f"a picture with {bands} bands of {picture.pixels.dtype} is no PNG: ask for the map in a format that "
+            "can hold it, or for application/json"
+        )
+    return Response(png(picture.pixels), media_type=kind)
+
+
+# --- choosing ---
+
+
+def _fitting(version: Version, layer: Layer, level: str | None, name: str | None) -> list[PartKey]:
+    keys = (entry.key for entry in version.parts)
+    return sorted(k for k in keys if k.layer == layer and level in (None, k.level) and name in (None, k.name))
+
+
+def _one(version: Version, layer: Layer, level: str | None, name: str | None) -> PartKey:
+    """The part that is meant: the named one, else ``map``, else the only one; Ambiguous names the choices."""
+    keys = _fitting(version, layer, level, name)
+    if not keys:
+        raise _none(version, layer, level, name)
+    usual = [k for k in keys if k.name == MAP] if name is None else keys
+    if len(keys) == 1 or len(usual) == 1:
+        return keys[0] if len(keys) == 1 else usual[0]
+    choices = usual or keys
+    names = ", ".join(sorted({k.name for k in keys}))
+    levels = ", ".join(sorted({k.level for k in choices}))
+    raise Ambiguous(
+        f"several parts of {layer} fit: give name (one of {names})"
+        + (f" and level (one of {levels})" if len({k.level for k in choices}) > 1 else ""),
+        [Problem(f"level {k.level}", where=k.name) for k in keys],
+    )
+
+
+def _none(version: Version, layer: Layer, level: str | None, name: str | None) -> NotFound:
+    known = [f"{e.key.name} (level {e.key.level})" for e in version.parts if e.key.layer == layer]
+    asked = " ".join(f"{k}={t!r}" for k, t in (("level", level), ("name", name)) if t is not None)
+    what = f"{layer} {asked}".strip()
+    return NotFound(f"version {version.number} has no {what}; it has: {', '.join(known) or 'none'}")
+
+
+def _no_datum(environment: str) -> MissingDatum:
+    return MissingDatum(
+        f'{environment} has no datum, so local metres have no place on earth: PATCH it with {{"datum": {{…}}}}, '
+        "upload a datum.yaml, or ask for the other crs"
+    )
+
+
+def _box(text: str | None, crs: Anchor) -> Box | None:
+    if text is None:
+        return None
+    if crs == "wgs84":
+        return box_of(text)
+    x0, y0, x1, y1 = numbers(text, "bbox", "X0,Y0,X1,Y1")
+    if not (x0 <= x1 and y0 <= y1 and max(map(abs, (x0, y0, x1, y1))) <= MAX_METRES):
+        raise Invalid("bbox must be X0,Y0,X1,Y1 in metres, the smaller ones first", [Problem("range", where="bbox")])
+    return x0, y0, x1, y1
+
+
+def _local_box(version: Version, text: str | None, crs: Anchor | None) -> Box | None:
+    """A box as one of the local frame: around the corners of one on earth. Grids default to the local frame."""
+    if text is None or crs != "wgs84":
+        wanted: Anchor = "wgs84" if crs is None and version.datum else "local"
+        if text is None or wanted == "local":
+            return _box(text, "local")
+    west, south, east, north = box_of(text)
+    assert version.datum is not None
+    east += 360.0 if east < west else 0.0
+    edge = np.linspace(0.0, 1.0, 9)
+    across, up = west + edge * (east - west), south + edge * (north - south)
+    ring = [(a, b) for a in across for b in (south, north)] + [(a, b) for a in (west, east) for b in up]
+    places = local_frame(version.datum).to_local(np.array(ring))
+    (x0, y0), (x1, y1) = places.min(axis=0), places.max(axis=0)
+    return float(x0), float(y0), float(x1), float(y1)
+
+
+def _choose(accept: str, *offered: str) -> str:
+    """The offered media type that the client likes best (RFC 9110, 12.5.1); NotAcceptable where there is none."""
+    best, choice = 0.0, None
+    for kind in offered:
+        quality = _quality(accept, kind)
+        if quality > best:
+            best, choice = quality, kind
+    if choice is None:
+        raise NotAcceptable(f"this can be had as {' or '.join(offered)}, not as {accept[:200]}")
+    return choice
+
+
+def _quality(accept: str, kind: str) -> float:
+    family = kind.partition("/")[0] + "/*"
+    found: Mapping[str, float] = dict(_ranges(accept))
+    for pattern in (kind, family, "*/*"):
+        if pattern in found:
+            return found[pattern]
+    return 0.0
+
+
+def _ranges(accept: str) -> list[tuple[str, float]]:
+    out = []
+    for item in accept.split(",")[:50]:
+        kind, *rest = (part.strip() for part in item.split(";"))
+        quality = 1.0
+        for parameter in rest:
+            if parameter.lower().startswith("q="):
+                try:
+                    quality = min(1.0, max(0.0, float(parameter[2:])))
+                except ValueError:
+                    quality = 0.0
+        out.append((kind.lower() or "*/*", quality))
+    return out

@@ -1,0 +1,466 @@
+"""Maps as robots fetch them: plain routes over an LRU of answers, so that a fleet that asks again costs microseconds.
+
+``Front`` stands before everything else and answers what it has in memory: an answer is believed while
+``Store.generation()`` stays the same and for a second at most, the caller's token likewise. All else goes the long
+way: guard, route, recipe (the ETag), cache on disk, conversion.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import parse_qsl, quote, urlencode
+
+from fastapi import APIRouter, FastAPI, Query, Request
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.responses import Response, StreamingResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from app.api.access import Access, Principal, Viewer
+from app.api.answers import API, Route, answer, path_of
+from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
+from app.api.guard import only_from_here
+from app.api.jobs import Started, started
+from app.api.metrics import Metrics
+from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, told
+from app.api.services import Here, Services
+from app.convert import Recipe
+from app.convert.cache import Made, MadeFile
+from app.errors import Invalid, NotFound, Problem
+from app.store.values import LATEST, Version
+
+FRESH_SECONDS = 1.0
+IN_MEMORY = 8 * 2**20
+"""Files up to this many bytes are answered from memory; larger ones are streamed from disk."""
+
+CHUNK = 256 * 2**10
+PRODUCTION = "production"
+
+Headers = list[tuple[bytes, bytes]]
+Key = tuple[bytes, bytes]
+"""Raw path and raw query."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What an address asks for. version: None on a short address. file: None for the whole map."""
+
+    environment: str
+    version: str | None
+    format: str
+    file: str | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Resource:
+    """What stands at an address. body: None while it is not made, or too large for memory; path: then its file."""
+
+    wanted: Wanted
+    recipe: Recipe
+    etag: str
+    raw_etag: bytes
+    headers: Headers
+    bare: Headers
+    size: int
+    body: bytes | None
+    path: Path | None
+    generation: int
+    fresh_until: float
+    ok: Any
+    not_modified: Any
+
+
+class Hot:
+    """Answers in memory, and the long way to an answer."""
+
+    def __init__(self, here_bytes: int, access: Access, metrics: Metrics, generation: Any) -> None:
+        self._limit, self._size = here_bytes, 0
+        self.access, self._metrics, self.generation = access, metrics, generation
+        self._entries: OrderedDict[Key, Resource] = OrderedDict()
+        self._resolving: dict[Key, asyncio.Future[Recipe]] = {}
+        self._lock = threading.Lock()
+        self.hit = metrics.memory_hits.inc
+
+    def get(self, key: Key) -> Resource | None:
+        """What is known to stand there at this moment."""
+        found = self._entries.get(key)
+        if found is None or found.fresh_until < time.monotonic() or found.generation != self.generation():
+            return None
+        return found
+
+    async def find(self, request: Request, here: Services, who: Principal) -> Resource | Started:
+        """What stands at the request's address; made where need be, or the job that makes it."""
+        scope = request.scope
+        key: Key = (scope.get("raw_path") or scope["path"].encode(), scope["query_string"])
+        fresh = self.get(key)
+        if fresh is not None and (fresh.body is not None or fresh.path is not None):
+            return fresh
+        wanted = wanted_of(request)
+        values, derive = _options(key[1])
+        # Taken before anything is read: a commit in between makes this answer stale, never fresh.
+        generation, until = self.generation(), time.monotonic() + FRESH_SECONDS
+        recipe = await self._recipe(key, here, wanted, values, derive)
+        old = self._entries.get(key)
+        if old is not None and _same(old.recipe, recipe) and old.body is not None:
+            fresh = replace(old, generation=generation, fresh_until=until)
+            self._put(key, fresh)
+            return fresh
+        empty = self._resource(wanted, recipe, values, derive, generation, until, _route(request))
+        if _matches(request, empty.etag):
+            self._put(key, empty)
+            return empty
+        made = await run_in_threadpool(here.maps.ready, recipe)
+        if made is not None:
+            self._metrics.disk_hits.inc()
+        else:
+            outcome = await here.work.make(recipe, who, address_of(request))
+            if isinstance(outcome, Started):
+                return outcome
+            made = outcome
+        full = await run_in_threadpool(_filled, empty, made)
+        self._put(key, full)
+        return full
+
+    async def _recipe(
+        self, key: Key, here: Services, wanted: Wanted, values: Mapping[str, str], derive: bool
+    ) -> Recipe:
+        """One look into the store for all who ask at the same moment."""
+        running = self._resolving.get(key)
+        if running is None:
+            running = asyncio.ensure_future(run_in_threadpool(_resolve, here, wanted, values, derive))
+            self._resolving[key] = running
+            running.add_done_callback(partial(self._resolved, key))
+        return await asyncio.shield(running)
+
+    def _resolved(self, key: Key, done: asyncio.Future[Recipe]) -> None:
+        self._resolving.pop(key, None)
+        if not done.cancelled():
+            done.exception()  # looked at by whoever waits; nobody may be left
+
+    def _resource(
+        self,
+        wanted: Wanted,
+        recipe: Recipe,
+        values: Mapping[str, str],
+        derive: bool,
+        generation: int,
+        until: float,
+        route: str,
+    ) -> Resource:
+        version = recipe.version
+        etag = recipe.etag if wanted.file is None else _file_etag(recipe, wanted.file)
+        query = urlencode({**values, **({} if derive else {"derive": "false"})})
+        report = path_of("environments", version.environment, "versions", version.number, "reports", wanted.format)
+        bare = [
+            (b"etag", etag.encode()),
+            (b"cache-control", b"no-cache"),
+            (b"fleetmap-version", str(version.number).encode()),
+            (b"fleetmap-root", version.root.encode()),
+            (b"link", f'<{report}{"?" + query if query else ""}>; rel="describedby"'.encode()),
+            (b"x-content-type-options", b"nosniff"),
+        ]
+        count = self._metrics.requests.labels
+        ok, not_modified = count("GET", route, "200").inc, count("GET", route, "304").inc
+        return Resource(
+            wanted, recipe, etag, etag.encode(), [], bare, 0, None, None, generation, until, ok, not_modified
+        )
+
+    def _put(self, key: Key, resource: Resource) -> None:
+        with self._lock:
+            old = self._entries.pop(key, None)
+            self._size += _weight(resource) - (_weight(old) if old else 0)
+            self._entries[key] = resource
+            while self._size > self._limit and len(self._entries) > 1:
+                self._size -= _weight(self._entries.popitem(last=False)[1])
+
+
+def _weight(resource: Resource) -> int:
+    return 2048 + len(resource.body or b"")
+
+
+def _file_etag(recipe: Recipe, name: str) -> str:
+    import hashlib
+
+    return f'{recipe.etag[:-1]}-{hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]}"'
+
+
+def _same(a: Recipe, b: Recipe) -> bool:
+    return a.key == b.key and a.version.number == b.version.number and a.version.environment == b.version.environment
+
+
+def _matches(request: Request, etag: str) -> bool:
+    """Whether the client has it already; ``*`` says nothing about a file that may not exist."""
+    header = request.headers.get("if-none-match")
+    return header is not None and header.strip() != "*" and none_match(header, etag)
+
+
+def _resolve(here: Services, wanted: Wanted, values: Mapping[str, str], derive: bool) -> Recipe:
+    return here.maps.recipe(version_of(here, wanted), wanted.format, values, derive=derive)
+
+
+def version_of(here: Services, wanted: Wanted) -> Version:
+    """The version that an address means: on a short one production where there is one, else the head."""
+    if wanted.version is not None:
+        return here.store.version(wanted.environment, number_of(wanted.version))
+    try:
+        return here.store.version(wanted.environment, PRODUCTION)
+    except NotFound:
+        return here.store.version(wanted.environment, LATEST)
+
+
+def number_of(ref: str) -> str | int:
+    """A version as an address names it: a number, or a channel."""
+    return int(ref) if ref.isascii() and ref.isdigit() and len(ref) <= 18 else ref
+
+
+def _filled(empty: Resource, made: Made) -> Resource:
+    """With headers and content of the made map. NotFound where it has no such file."""
+    name = empty.wanted.file
+    file = made.whole() if name is None else made.file(name)
+    if file is None:
+        names = ", ".join(f.name for f in made.files[:20])
+        raise NotFound(f"this map has no file {name!r}; its files are: {names}")
+    headers = [
+        (b"content-type", _media_type(file).encode()),
+        (b"accept-ranges", b"bytes"),
+        (b"content-disposition", content_disposition(file.name).encode()),
+        *empty.bare,
+    ]
+    if file.size > IN_MEMORY:
+        return replace(empty, headers=headers, size=file.size, path=file.path)
+    body = file.path.read_bytes()
+    headers.insert(0, (b"content-length", str(len(body)).encode()))
+    return replace(empty, headers=headers, size=len(body), body=body)
+
+
+def _media_type(file: MadeFile) -> str:
+    known = file.media_type
+    return f"{known}; charset=utf-8" if known.startswith("text/") and "charset" not in known else known
+
+
+_SHORT = re.compile(r"/maps/([^/]+)/([^/]+)(?:/(.+))?", re.DOTALL)
+_LONG = re.compile(rf"{API}/environments/([^/]+)/versions/([^/]+)/maps/([^/]+)(?:/(.+))?", re.DOTALL)
+
+
+def wanted_of(request: Request) -> Wanted:
+    """What the address of a map asks for."""
+    path = request.scope["path"]
+    short, long = _SHORT.fullmatch(path), _LONG.fullmatch(path)
+    if short:
+        return Wanted(short[1], None, short[2], short[3])
+    if long:
+        return Wanted(long[1], long[2], long[3], long[4])
+    raise NotFound("there is no map at this address")
+
+
+def _route(request: Request) -> str:
+    return getattr(request.scope.get("route"), "path", "maps")
+
+
+def address_of(request: Request) -> str:
+    """The request's own address, to be asked for again."""
+    query = request.url.query
+    return quote(request.scope["path"], safe="/") + (f"?{quote(query, safe='&=%,.:+-_~/')}" if query else "")
+
+
+def _options(query: bytes) -> tuple[dict[str, str], bool]:
+    """The format's options, and whether derived information is allowed. Invalid for what is given twice."""
+    try:
+        pairs = parse_qsl(query.decode("ascii"), keep_blank_values=True, max_num_fields=100, errors="strict")
+    except ValueError:
+        raise Invalid("the query cannot be read: it must be percent-encoded UTF-8 with at most 100 members") from None
+    values: dict[str, str] = {}
+    for name, value in pairs:
+        if name in values:
+            raise Invalid(f"the parameter {name[:80]!r} is given twice", [Problem("given twice", where=name[:80])])
+        values[name] = value
+    derive = values.pop("derive", "true")
+    if derive not in ("true", "false"):
+        raise Invalid(f"derive must be true or false, got {derive[:80]!r}", [Problem("true or false", where="derive")])
+    return values, derive == "true"
+
+
+class Front:
+    """ASGI middleware that answers repeated requests for maps from memory."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer from memory, or pass on."""
+        if scope["type"] == "http":
+            method = scope["method"]
+            if method in ("GET", "HEAD"):
+                hot: Hot = scope["app"].state.services.hot
+                found = hot.get((scope.get("raw_path") or b"", scope["query_string"]))
+                if found is not None:
+                    reply = _reply(hot, found, scope["headers"], method == "HEAD")
+                    if reply is not None:
+                        await send(reply[0])
+                        await send(reply[1])
+                        return
+        await self._app(scope, receive, send)
+
+
+_EMPTY = {"type": "http.response.body", "body": b""}
+
+
+def _reply(
+    hot: Hot, found: Resource, headers: list[tuple[bytes, bytes]], head_only: bool
+) -> tuple[dict[str, Any], dict[str, Any]] | None:
+    """The two messages of an answer, or None where it takes the long way."""
+    authorization = condition = None
+    for name, value in headers:
+        if name == b"authorization":
+            authorization = value
+        elif name == b"if-none-match":
+            if condition is not None:
+                return None
+            condition = value
+        elif name in (b"range", b"if-match"):
+            return None
+    who = hot.access.known(authorization)
+    if who is None or not who.may_enter(found.wanted.environment):
+        return None
+    if hot.access.insecure:
+        only_from_here(dict(headers))
+    if condition is not None and (condition == found.raw_etag or none_match(condition.decode("latin-1"), found.etag)):
+        if found.body is None and condition.strip() == b"*":
+            return None
+        hot.hit()
+        found.not_modified()
+        return {"type": "http.response.start", "status": 304, "headers": found.bare}, _EMPTY
+    if found.body is None:
+        return None
+    hot.hit()
+    found.ok()
+    body = _EMPTY if head_only else {"type": "http.response.body", "body": found.body}
+    return {"type": "http.response.start", "status": 200, "headers": found.headers}, body
+
+
+async def download(request: Request) -> Response:
+    """A map, or one of its files: the long way."""
+    here: Services = request.app.state.services
+    who: Principal = request.scope["state"]["principal"]
+    found = await here.hot.find(request, here, who)
+    if isinstance(found, Started):
+        return started(found.job)
+    if none_match(request.headers.get("if-none-match"), found.etag):
+        return _response(304, found.bare)
+    if found.path is not None:
+        return await _from_disk(request, found)
+    body = found.body or b""
+    part = byte_range(request.headers.get("range"), request.headers.get("if-range"), found.etag, found.size)
+    if isinstance(part, Unsatisfiable):
+        raise _unsatisfiable(found.size)
+    if part is None:
+        return _response(200, found.headers, body)
+    return _response(206, _partial_headers(found, part), body[part[0] : part[1]])
+
+
+def _response(status: int, headers: Headers, body: bytes = b"") -> Response:
+    response = Response(body, status)
+    response.raw_headers = list(headers)
+    return response
+
+
+def _unsatisfiable(size: int) -> HTTPException:
+    return HTTPException(416, f"the file has {size} bytes", {"content-range": f"bytes */{size}"})
+
+
+def _partial_headers(found: Resource, part: tuple[int, int]) -> Headers:
+    kept = [(n, v) for n, v in found.headers if n != b"content-length"]
+    start, end = part
+    return [
+        (b"content-length", str(end - start).encode()),
+        (b"content-range", f"bytes {start}-{end - 1}/{found.size}".encode()),
+        *kept,
+    ]
+
+
+async def _from_disk(request: Request, found: Resource) -> Response:
+    """A large file, in chunks. It is opened before the answer starts, so the cache may drop it meanwhile."""
+    assert found.path is not None
+    part = byte_range(request.headers.get("range"), request.headers.get("if-range"), found.etag, found.size)
+    if isinstance(part, Unsatisfiable):
+        raise _unsatisfiable(found.size)
+    head_only = bool(request.scope.get("state", {}).get("head"))
+    start, end = part or (0, found.size)
+    headers = _partial_headers(found, part) if part else [(b"content-length", str(found.size).encode()), *found.headers]
+    status = 206 if part else 200
+    if head_only:
+        return _response(status, headers)
+    file = await run_in_threadpool(found.path.open, "rb")
+    return streamed(file, start, end, status, headers)
+
+
+def streamed(file: BinaryIO, start: int, end: int, status: int, headers: Headers) -> Response:
+    """The bytes [start, end) of an open file, which is closed at the end."""
+
+    async def chunks() -> AsyncIterator[bytes]:
+        try:
+            await run_in_threadpool(file.seek, start)
+            left = end - start
+            while left > 0:
+                chunk = await run_in_threadpool(file.read, min(CHUNK, left))
+                if not chunk:
+                    raise OSError("a file that is being sent became shorter")
+                left -= len(chunk)
+                yield chunk
+        finally:
+            file.close()
+
+    response = StreamingResponse(chunks(), status)
+    response.raw_headers = list(headers)
+    return response
+
+
+def add_routes(app: FastAPI) -> None:
+    """The plain routes of maps; documented in ``app.api.openapi``."""
+    base = f"{API}/environments/{{env}}/versions/{{v}}/maps/{{format}}"
+    for path in (base, base + "/{file:path}", "/maps/{env}/{format}", "/maps/{env}/{format}/{file:path}"):
+        app.router.add_route(path, download, methods=["GET"], include_in_schema=False)
+
+
+router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=Route)
+
+
+@router.get("/maps", responses=told(list[CoverageOut], 404), summary="Which formats can be had")
+def coverage(env: EnvironmentPath, v: VersionPath, here: Here, _: Viewer) -> Response:
+    """For every format: whether it can be written as it is, by deriving what lacks, or what to supply."""
+    return answer(here.maps.coverage(here.store.version(env, number_of(v))))
+
+
+@router.get(
+    "/reports/{format}",
+    responses=told(ReportOut, 404, 409, 422),
+    summary="What a map is made of",
+    openapi_extra={"x-free-query": True},
+)
+async def report(
+    env: EnvironmentPath,
+    v: VersionPath,
+    format: FormatPath,
+    request: Request,
+    here: Here,
+    who: Viewer,
+    derive: bool = Query(True, description="Whether derived information is allowed."),
+) -> Response:
+    """Raw, derived and filled-in information of a map, what was dropped and why. Takes the map's own parameters."""
+    values, allowed = _options(request.scope["query_string"])
+    wanted = Wanted(env, v, format, None)
+    recipe = await run_in_threadpool(_resolve, here, wanted, values, allowed and derive)
+    if await run_in_threadpool(here.maps.ready, recipe) is None:
+        outcome = await here.work.make(recipe, who, address_of(request))
+        if isinstance(outcome, Started):
+            return started(outcome.job)
+    return answer(await run_in_threadpool(here.maps.report, recipe))

@@ -1,0 +1,71 @@
+"""Prometheus: requests, conversions, cache hits, heads.
+
+With several worker processes prometheus_client keeps the counters in files (``PROMETHEUS_MULTIPROC_DIR``, set by
+``app.main.serve``), and any worker answers for all of them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest, multiprocess
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from app.store import Store
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+MAX_HEADS = 10_000
+
+
+class Metrics:
+    """The counters of one application."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self.requests = Counter(
+            "fleetmap_requests", "Requests answered.", ["method", "route", "status"], registry=self.registry
+        )
+        self.seconds = Histogram(
+            "fleetmap_request_seconds",
+            "Time to the end of an answer, without those from memory.",
+            ["route"],
+            registry=self.registry,
+            buckets=(0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100),
+        )
+        self.conversions = Counter("fleetmap_conversions", "Maps made.", ["format", "result"], registry=self.registry)
+        hits = Counter("fleetmap_cache_hits", "Maps answered without making them.", ["cache"], registry=self.registry)
+        self.memory_hits = hits.labels("memory")
+        self.disk_hits = hits.labels("disk")
+        self.uploads = Counter("fleetmap_uploads", "Uploads and edits.", ["result"], registry=self.registry)
+
+    def render(self, store: Store) -> bytes:
+        """The text that Prometheus reads."""
+        registry = self.registry
+        if os.environ.get("PROMETHEUS_MULTIPROC_DIR"):
+            registry = CollectorRegistry()
+            multiprocess.MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
+        heads = CollectorRegistry()
+        heads.register(_Heads(store))
+        return generate_latest(registry) + generate_latest(heads)
+
+
+class _Heads(Collector):
+    """Every environment's newest version, and how many environments there are."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def collect(self) -> Iterable[Metric]:
+        heads = GaugeMetricFamily("fleetmap_head", "Number of an environment's newest version.", labels=["environment"])
+        count, cursor = 0, None
+        while count < MAX_HEADS:
+            page, cursor = self._store.environments(limit=1000, cursor=cursor)
+            for environment in page:
+                heads.add_metric([environment.name], environment.head)
+            count += len(page)
+            if cursor is None:
+                break
+        yield heads
+        yield GaugeMetricFamily("fleetmap_environments", "Environments that are not deleted.", value=count)

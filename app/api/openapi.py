@@ -1,0 +1,259 @@
+"""OpenAPI: what FastAPI cannot know by itself, the maps' plain routes, and the pages at /docs without a network."""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.openapi.docs import get_swagger_ui_html
+from fastapi.openapi.utils import get_openapi
+from pydantic import BaseModel
+from starlette.responses import Response
+
+from app import formats, parameters
+from app.api.access import AtLeast, is_open
+from app.api.answers import API
+from app.api.problems import MEDIA_TYPE
+from app.api.schemas import ProblemOut, RevertBody, told
+from app.errors import NotFound
+
+ASSETS = {
+    "swagger-ui-bundle.js": "text/javascript",
+    "swagger-ui.css": "text/css",
+    "favicon.png": "image/png",
+}
+_PACKAGE = "fastapi_offline"
+
+DESCRIPTION = """\
+Every environment's maps, versioned in canonical layers, for every robot in its own format.
+
+All errors are `application/problem+json` (RFC 9457). Lists come in pages: the `Link` header names the next one.
+Versions are named by number, by channel (`production`), or `latest`. Coordinates are `longitude, latitude` in GeoJSON
+and `latitude, longitude` in query parameters, as their names say.
+
+Access: `Authorization: Bearer <token>`. Roles: `viewer` and `robot` read; `editor` also uploads, edits, converts, moves
+channels and sets datums; `admin` does all.
+"""
+
+
+def add_pages(app: FastAPI) -> None:
+    """``/openapi.json`` and ``/docs``, with all that the page loads from this server."""
+
+    async def schema(_: Request) -> Response:
+        import orjson
+
+        return Response(orjson.dumps(app.openapi()), media_type="application/json")
+
+    async def docs(_: Request) -> Response:
+        return get_swagger_ui_html(
+            openapi_url="/openapi.json",
+            title=f"{app.title}: HTTP interface",
+            swagger_js_url="/docs/swagger-ui-bundle.js",
+            swagger_css_url="/docs/swagger-ui.css",
+            swagger_favicon_url="/docs/favicon.png",
+            swagger_ui_parameters={"persistAuthorization": False, "docExpansion": "none", "tryItOutEnabled": True},
+        )
+
+    async def asset(request: Request) -> Response:
+        name = request.path_params["name"]
+        if name not in ASSETS:
+            raise NotFound("the documentation has no such file")
+        data = resources.files(_PACKAGE).joinpath("static", name).read_bytes()
+        return Response(data, headers={"cache-control": "public, max-age=86400"}, media_type=ASSETS[name])
+
+    app.router.add_route("/openapi.json", schema, methods=["GET"], include_in_schema=False)
+    app.router.add_route("/docs", docs, methods=["GET"], include_in_schema=False)
+    app.router.add_route("/docs/{name}", asset, methods=["GET"], include_in_schema=False)
+    app.openapi = lambda: _schema(app)  # type: ignore[method-assign]
+
+
+def _schema(app: FastAPI) -> dict[str, Any]:
+    if app.openapi_schema is None:
+        app.openapi_schema = build(app)
+    return app.openapi_schema
+
+
+def build(app: FastAPI) -> dict[str, Any]:
+    """The whole description."""
+    schema = get_openapi(
+        title=app.title,
+        version=app.version,
+        summary="HTTP interface of the Fleet Map Server",
+        description=DESCRIPTION,
+        routes=app.routes,
+    )
+    components = schema.setdefault("components", {})
+    schemas = components.setdefault("schemas", {})
+    schemas.pop("HTTPValidationError", None)
+    schemas.pop("ValidationError", None)
+    models: dict[str, type[BaseModel]] = {"Problem": ProblemOut, "RevertBody": RevertBody}
+    for name, model in models.items():
+        shape = model.model_json_schema(ref_template="#/components/schemas/{model}")
+        schemas.update(shape.pop("$defs", {}))
+        schemas[name] = shape
+    components["securitySchemes"] = {
+        "token": {"type": "http", "scheme": "bearer", "description": "A token; see `/api/v1/tokens`."}
+    }
+    _map_paths(schema["paths"])
+    for path, operations in schema["paths"].items():
+        for operation in operations.values():
+            _finish(path, operation)
+    schema["tags"] = [
+        {"name": name, "description": text}
+        for name, text in (
+            ("environments", "Mapped places."),
+            ("versions", "Immutable states: upload, edit, revert, compare."),
+            ("sources", "The uploaded files, byte for byte."),
+            ("layers", "Canonical content."),
+            ("maps", "Maps in a format, converted on demand."),
+            ("channels", "Which version robots drive on."),
+            ("transform", "Between earth and local frame."),
+            ("formats", "What can be read, served and converted."),
+            ("jobs", "Work that takes long."),
+            ("tokens", "Access."),
+            ("health", "Operation."),
+        )
+    ]
+    return schema
+
+
+def _finish(path: str, operation: dict[str, Any]) -> None:
+    """The problems that every call can meet, and the token."""
+    operation.pop("x-free-query", None)
+    problem = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    responses = operation["responses"]
+    common: dict[str, str] = {}
+    if not is_open(path):
+        operation["security"] = [{"token": []}]
+        common |= {
+            "401": "A token is needed, or it is unknown or has expired.",
+            "403": "The token's role or its environments do not allow it.",
+            "429": "Too many wrong tokens from this address.",
+        }
+        common["422"] = "A parameter, the body or a file cannot be used; `errors` says where."
+        common["503"] = "Too busy, or a part of the server does not answer: try again after `Retry-After` seconds."
+    if "requestBody" in operation:
+        common |= {
+            "400": "The body is malformed.",
+            "408": "The body stopped coming.",
+            "413": "The body is larger than the server takes.",
+            "415": "A media type or content coding that is not taken.",
+        }
+    for status, text in common.items():
+        known = responses.get(status)
+        if known is None or "HTTPValidationError" in str(known):
+            responses[status] = {"description": text, "content": problem}
+
+
+def _map_paths(paths: dict[str, Any]) -> None:
+    """The plain routes, as ``app.api.maps`` serves them; the formats' parameters from their declarations."""
+    long = f"{API}/environments/{{env}}/versions/{{v}}/maps/{{format}}"
+    for path, summary, extra in (
+        (long, "A map in a format", ()),
+        (long + "/{file}", "One file of a map", ("file",)),
+        ("/maps/{env}/{format}", "A map, by the short address for robots", ()),
+        ("/maps/{env}/{format}/{file}", "One file of a map, by the short address", ("file",)),
+    ):
+        names = [n for n in ("env", "v", "format") if "{" + n + "}" in path] + list(extra)
+        content: dict[str, Any] = {"application/octet-stream": {}, "application/zip": {}}
+        describing = "The file itself where the format is one file, else a zip of all." if not extra else "The file."
+        short = " From the channel `production` where there is one, else `latest`." if path.startswith("/maps") else ""
+        operation = {
+            "tags": ["maps"],
+            "summary": summary,
+            "operationId": "get_" + "_".join(["map", *(["file"] if extra else []), *(["short"] if short else [])]),
+            "description": f"{describing}{short} Derives what is missing. Ask again with `If-None-Match`: it costs "
+            "nothing. `Link` names the report on what was raw, derived, filled in or dropped.",
+            "parameters": [_path_parameter(name) for name in names] + _query_parameters() + _header_parameters(),
+            "responses": {
+                "200": {"description": describing, "headers": _HEADERS, "content": content},
+                "202": {
+                    "description": "It takes long: follow the job at `Location`, then ask again.",
+                    "content": {"application/json": {"schema": {"$ref": "#/components/schemas/JobOut"}}},
+                },
+                "206": {"description": "A part of the file"},
+                "304": {"description": "The client has it"},
+                **{str(k): v for k, v in told(None, 404, 409, 416, 422, 503).items()},
+            },
+        }
+        paths[path] = {"get": operation}
+
+
+_HEADERS: dict[str, Any] = {
+    "ETag": {"schema": {"type": "string"}, "description": "Strong: equal tags mean equal bytes."},
+    "Fleetmap-Version": {"schema": {"type": "integer"}},
+    "Fleetmap-Root": {"schema": {"type": "string"}},
+    "Link": {"schema": {"type": "string"}, "description": 'The report, `rel="describedby"`.'},
+}
+
+_EXAMPLES = {
+    "env": ("An environment's name.", "farm"),
+    "v": ("Number, channel, or `latest`.", "latest"),
+    "format": ("A format's id.", "geojson"),
+    "file": ("A file's name; it may have folders.", "map.geojson"),
+}
+
+
+def _path_parameter(name: str) -> dict[str, Any]:
+    description, example = _EXAMPLES[name]
+    schema: dict[str, Any] = {"type": "string"}
+    if name == "format":
+        schema["enum"] = [known.name for known in formats.all_formats().values() if known.write]
+    return {
+        "name": name,
+        "in": "path",
+        "required": True,
+        "description": description,
+        "schema": schema,
+        "example": example,
+    }
+
+
+def _query_parameters() -> list[dict[str, Any]]:
+    """``derive``, and the options of all formats; one that several have is told once, with what it means for each."""
+    out: dict[str, dict[str, Any]] = {}
+    for known in formats.all_formats().values():
+        if not known.write:
+            continue
+        for option in parameters.describe(known.write_options):
+            text = f"`{known.name}`: {option['description']} Default: {option['default']!r}."
+            entry = out.setdefault(
+                option["name"],
+                {"name": option["name"], "in": "query", "description": "", "schema": dict(option["schema"])},
+            )
+            if entry["schema"] != option["schema"]:
+                entry["schema"] = {"type": "string"}
+            entry["description"] = f"{entry['description']} {text}".strip()
+    derive = {
+        "name": "derive",
+        "in": "query",
+        "description": "`false`: only from information that is stored as it is.",
+        "schema": {"type": "boolean", "default": True},
+    }
+    return [derive, *(out[name] for name in sorted(out))]
+
+
+def _header_parameters() -> list[dict[str, Any]]:
+    texts = {
+        "If-None-Match": "ETags that the client has.",
+        "Range": "One range of bytes.",
+        "If-Range": "The range holds only for this ETag.",
+    }
+    return [
+        {"name": name, "in": "header", "description": text, "schema": {"type": "string"}}
+        for name, text in texts.items()
+    ]
+
+
+def unguarded(app: FastAPI) -> list[str]:
+    """Routes under the API that declare no role: there must be none."""
+    out = []
+    for route in app.routes:
+        dependant = getattr(route, "dependant", None)
+        path = getattr(route, "path", "")
+        if dependant is None or is_open(path):
+            continue
+        if not any(isinstance(inner.call, AtLeast) for inner in dependant.dependencies):
+            out.append(path)
+    return out

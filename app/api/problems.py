@@ -1,0 +1,233 @@
+"""RFC 9457: every error of the server in one wire shape, ``application/problem+json``.
+
+``{type, title, status, detail, errors?: [{file?, line?, where?, problem}]}``. The table below is the only place that
+knows which class of error has which status.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import traceback
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
+from pathlib import PurePath
+from typing import Any
+
+import orjson
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+
+from app import errors
+from app.pool import WorkerDied
+
+log = logging.getLogger(__name__)
+
+MEDIA_TYPE = "application/problem+json"
+
+
+class MalformedBody(errors.Invalid):
+    """A request body that is not what its media type says (JSON that does not parse, a broken multipart)."""
+
+
+class UnsupportedMedia(errors.Invalid):
+    """A media type or content coding that the call does not take."""
+
+
+class NotAcceptable(errors.Invalid):
+    """None of the media types that the client accepts can be served."""
+
+
+class SlowBody(errors.FleetMapError):
+    """The client stopped sending its body."""
+
+
+class Throttled(errors.Denied):
+    """Too many wrong tokens from this address; ``retry_after`` in seconds."""
+
+    retry_after = 60
+
+
+STATUS: Mapping[type[errors.FleetMapError], tuple[int, str]] = {
+    errors.NotFound: (404, "Not found"),
+    errors.Gone: (404, "Deleted"),
+    MalformedBody: (400, "Malformed body"),
+    UnsupportedMedia: (415, "Unsupported media type"),
+    NotAcceptable: (406, "Not acceptable"),
+    SlowBody: (408, "Request timeout"),
+    errors.Invalid: (422, "Invalid request"),
+    errors.BadUpload: (422, "Bad upload"),
+    errors.UnreadableFile: (422, "Unreadable file"),
+    errors.TooLarge: (413, "Too large"),
+    errors.UnsafeArchive: (422, "Unsafe archive"),
+    WorkerDied: (422, "Processing failed"),
+    errors.CannotConvert: (422, "Cannot convert"),
+    errors.MissingLayer: (422, "Missing layer"),
+    errors.MissingDatum: (422, "Missing datum"),
+    errors.Ambiguous: (409, "Ambiguous"),
+    errors.Conflict: (409, "Conflict"),
+    errors.StaleParent: (412, "The head has moved"),
+    Throttled: (429, "Too many failures"),
+    errors.Denied: (403, "Denied"),
+    errors.Unauthenticated: (401, "Token needed"),
+    errors.Unavailable: (503, "Unavailable"),
+    errors.Damaged: (500, "Damaged data"),
+}
+"""Class -> status and title; a class that is not listed takes its nearest base's."""
+
+RETRY_SECONDS = 5
+MAX_ERRORS = 100
+
+
+def status_of(error: errors.FleetMapError) -> tuple[int, str, str]:
+    """Status, title and the problem's type of an error."""
+    for cls in type(error).__mro__:
+        if cls in STATUS:
+            status, title = STATUS[cls]
+            name = "".join("-" + c.lower() if c.isupper() else c for c in cls.__name__).strip("-")
+            return status, title, f"urn:fleetmap:problem:{name}"
+    return 500, "Internal error", "about:blank"
+
+
+def document(
+    status: int,
+    detail: str,
+    *,
+    title: str | None = None,
+    type_: str = "about:blank",
+    problems: Sequence[errors.Problem] = (),
+) -> dict[str, Any]:
+    """The JSON of a problem."""
+    out: dict[str, Any] = {
+        "type": type_,
+        "title": title or HTTPStatus(status).phrase,
+        "status": status,
+        "detail": clean(detail),
+    }
+    if problems:
+        out["errors"] = [{**p.as_dict(), "problem": clean(p.problem)} for p in problems[:MAX_ERRORS]]
+    return out
+
+
+def clean(text: str) -> str:
+    """A text that JSON can carry: lone surrogates shown as escapes, and not longer than a page."""
+    if len(text) > 4000:
+        text = text[:4000] + " …"
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+def problem(
+    status: int,
+    detail: str,
+    *,
+    title: str | None = None,
+    type_: str = "about:blank",
+    problems: Sequence[errors.Problem] = (),
+    headers: Mapping[str, str] | None = None,
+) -> Response:
+    """The answer for a problem."""
+    body = document(status, detail, title=title, type_=type_, problems=problems)
+    extra = {"cache-control": "no-store", **(headers or {})}
+    return Response(orjson.dumps(body), status, extra, MEDIA_TYPE)
+
+
+def as_document(error: errors.FleetMapError) -> dict[str, Any]:
+    """The JSON of an error, for a job that failed."""
+    status, title, type_ = status_of(error)
+    return document(status, error.detail, title=title, type_=type_, problems=error.problems)
+
+
+def of_error(error: errors.FleetMapError) -> Response:
+    """The answer for one of our own errors."""
+    status, title, type_ = status_of(error)
+    headers = {}
+    if isinstance(error, errors.Unauthenticated):
+        headers["www-authenticate"] = 'Bearer realm="fleetmap"'
+    elif isinstance(error, Throttled):
+        headers["retry-after"] = str(error.retry_after)
+    elif status == 503:
+        headers["retry-after"] = str(RETRY_SECONDS)
+    elif isinstance(error, SlowBody):
+        headers["connection"] = "close"
+    if isinstance(error, errors.Damaged):
+        # The operator's alarm; the client learns only that it was not its fault.
+        log.critical("stored data is damaged: %s", error.detail)
+    return problem(status, error.detail, title=title, type_=type_, problems=error.problems, headers=headers)
+
+
+def of_http(error: HTTPException) -> Response:
+    """The answer for Starlette's and FastAPI's own errors (no route, wrong method …)."""
+    if error.status_code in (204, 304):
+        return Response(status_code=error.status_code, headers=error.headers)
+    details = {
+        404: "there is nothing at this address; /docs lists what there is",
+        405: "this address does not take this method",
+    }
+    phrase = HTTPStatus(error.status_code).phrase
+    detail = str(error.detail)
+    if detail == phrase:
+        detail = details.get(error.status_code, detail)
+    return problem(error.status_code, detail, headers=error.headers)
+
+
+def of_validation(error: RequestValidationError) -> Response:
+    """The answer for a request that does not fit its schema; 400 where the body is not even JSON."""
+    problems = []
+    for item in error.errors():
+        where = ".".join(str(part) for part in item.get("loc", ()))
+        if item.get("type") == "json_invalid":
+            reason = str(item.get("ctx", {}).get("error", item["msg"]))
+            found = errors.Problem(f"not JSON: {reason}", where=f"character {item['loc'][-1]}")
+            return problem(
+                400,
+                "the request body is not JSON",
+                title="Malformed body",
+                type_="urn:fleetmap:problem:malformed-body",
+                problems=[found],
+            )
+        problems.append(errors.Problem(str(item["msg"]).removeprefix("Value error, "), where=where))
+    detail = "; ".join(f"{p.where}: {p.problem}" for p in problems[:5])
+    return problem(422, detail, title="Invalid request", type_="urn:fleetmap:problem:invalid", problems=problems)
+
+
+def of_bug(error: BaseException) -> Response:
+    """The answer for anything else. The log gets the class and our own lines, no data, paths or tokens."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        log.critical("no room left on the server's disk")
+        return problem(
+            507,
+            "the server has no room left; nothing was stored. Try again once its operator has made room",
+            headers={"retry-after": "60"},
+        )
+    log.error("internal error: %s", describe(error))
+    return problem(500, "the server made a mistake; its log says where. Nothing was stored", title="Internal error")
+
+
+def describe(error: BaseException) -> str:
+    """Class and places of an exception in one line: ``ValueError at store.versions:120 < api.maps:33``.
+
+    Neither its text (it may hold data or names of files) nor whole paths.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [f"{PurePath(f.filename).parent.name}.{PurePath(f.filename).stem}:{f.lineno}" for f in frames]
+    return f"{type(error).__name__} at {' < '.join(reversed(ours[-6:]))}"
+
+
+async def handle_error(_: Request, error: Exception) -> Response:
+    """FastAPI's handler for our own errors."""
+    assert isinstance(error, errors.FleetMapError)
+    return of_error(error)
+
+
+async def handle_http(_: Request, error: Exception) -> Response:
+    """FastAPI's handler for HTTP errors."""
+    assert isinstance(error, HTTPException)
+    return of_http(error)
+
+
+async def handle_validation(_: Request, error: Exception) -> Response:
+    """FastAPI's handler for requests that do not fit their schema."""
+    assert isinstance(error, RequestValidationError)
+    return of_validation(error)

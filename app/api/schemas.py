@@ -1,0 +1,461 @@
+"""The edge's shapes: what bodies and parameters may be, what answers look like, and examples that work.
+
+The examples fit each other: a test runs every one of them against a server that holds the environment ``farm``.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal
+
+from fastapi import Header, Path, Query
+from pydantic import BaseModel, ConfigDict, Field
+
+from app.api.problems import MEDIA_TYPE
+from app.model.frame import MAX_DATUM_LATITUDE
+
+NAME = r"^[a-z0-9][a-z0-9_-]{0,62}$"
+CHANNEL = r"^[a-z][a-z0-9_-]{0,62}$"
+
+MAX_TEXT = 20_000
+RESERVED = frozenset({"robots", "server"})
+
+
+class In(BaseModel):
+    """A request body: unknown members and numbers that are not finite are refused."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class DatumBody(In):
+    """Where the local frame's origin is (WGS 84), and where its +y axis points."""
+
+    latitude: float = Field(ge=-MAX_DATUM_LATITUDE, le=MAX_DATUM_LATITUDE, description="Degrees north.")
+    longitude: float = Field(ge=-180, le=180, description="Degrees east.")
+    altitude: float = Field(0.0, ge=-12_000, le=100_000, description="Metres above the ellipsoid.")
+    heading: float = Field(0.0, ge=-360, le=360, description="Degrees clockwise from true north to the local +y axis.")
+
+
+class CloneBody(In):
+    """Whose content a new environment starts with."""
+
+    environment: str = Field(examples=["farm"])
+    version: int | str = Field("latest", description="Number, channel or `latest`.", examples=["latest"])
+
+
+class EnvironmentBody(In):
+    """A new environment."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "orchard-2",
+                    "title": "Orchard behind the barn",
+                    "datum": {"latitude": 53.2686, "longitude": -0.5245},
+                    "tags": ["apple"],
+                }
+            ]
+        },
+    )
+
+    name: str = Field(pattern=NAME, description="Lower case letters, digits, `_` and `-`; not `robots` or `server`.")
+    title: str = Field("", max_length=200)
+    description: str = Field("", max_length=MAX_TEXT)
+    datum: DatumBody | None = Field(None, description="Gives version 1; without it the environment starts empty.")
+    tags: list[Annotated[str, Field(min_length=1, max_length=100)]] = Field(default_factory=list, max_length=100)
+    clone: CloneBody | None = Field(None, description="Start with the content of another one (gives version 1).")
+
+
+class EnvironmentPatch(In):
+    """What is to change; what is left out stays."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={"examples": [{"title": "The farm by the river", "tags": ["wheat"]}]},
+    )
+
+    name: str | None = Field(None, pattern=NAME, description="A new name; the old one is free at once.")
+    title: str | None = Field(None, max_length=200)
+    description: str | None = Field(None, max_length=MAX_TEXT)
+    tags: list[Annotated[str, Field(min_length=1, max_length=100)]] | None = Field(None, max_length=100)
+    datum: DatumBody | None = Field(
+        None,
+        description="Makes a version: local items keep their metres, wgs84 items their place on earth, and the answer "
+        "warns.",
+    )
+
+
+class RevertBody(In):
+    """A new version with the content of an old one."""
+
+    revert_to: int = Field(ge=0, description="The old version's number.")
+    message: str = Field("", max_length=MAX_TEXT)
+
+
+class PutChange(In):
+    """Add or replace one feature, by id."""
+
+    op: Literal["put"]
+    layer: Literal["location", "objects", "topology", "zones"]
+    feature: dict[str, Any] = Field(
+        description="GeoJSON Feature with an `id` (a text); `place` instead of `geometry` is local metres. An edge "
+        "without geometry runs straight."
+    )
+    level: str | None = Field(None, max_length=256)
+    name: str | None = Field(None, max_length=256, description="The part's name, where a layer has several.")
+    crs: Literal["local", "wgs84"] | None = Field(
+        None, description="What `geometry` is in; default: wgs84 where there is a datum."
+    )
+
+
+class DeleteChange(In):
+    """Remove one feature, by id."""
+
+    op: Literal["delete"]
+    layer: Literal["location", "objects", "topology", "zones"]
+    id: str = Field(min_length=1, max_length=512)
+    level: str | None = Field(None, max_length=256)
+    name: str | None = Field(None, max_length=256)
+
+
+class CellsChange(In):
+    """Set the cells of a grid whose centres lie in a polygon."""
+
+    op: Literal["cells"]
+    grid: str | None = Field(None, max_length=256, description="Default: `map`, else the only grid.")
+    level: str | None = Field(None, max_length=256)
+    polygon: dict[str, Any] = Field(description="GeoJSON Polygon or MultiPolygon.")
+    crs: Literal["local", "wgs84"] | None = Field(
+        None, description="What the polygon is in; default: wgs84 where there is a datum."
+    )
+    value: int = Field(ge=0, le=255, description="0 free … 100 occupied, 255 unknown.")
+
+
+Change = Annotated[PutChange | DeleteChange | CellsChange, Field(discriminator="op")]
+
+
+class EditsBody(In):
+    """Changes that make one version together, or none."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={
+            "examples": [
+                {
+                    "message": "a charging dock by the gate",
+                    "changes": [
+                        {
+                            "op": "put",
+                            "layer": "topology",
+                            "feature": {
+                                "type": "Feature",
+                                "id": "dock",
+                                "geometry": {"type": "Point", "coordinates": [-0.5245, 53.2687]},
+                                "properties": {"kind": "node", "name": "dock"},
+                            },
+                        },
+                        {
+                            "op": "put",
+                            "layer": "topology",
+                            "feature": {
+                                "type": "Feature",
+                                "id": "gate_dock",
+                                "geometry": None,
+                                "properties": {"kind": "edge", "source": "gate", "target": "dock"},
+                            },
+                        },
+                    ],
+                }
+            ]
+        },
+    )
+
+    message: str = Field("", max_length=MAX_TEXT)
+    changes: list[Change] = Field(min_length=1, max_length=100_000)
+
+
+class ChannelBody(In):
+    """Where a channel is to stand, and since when."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, json_schema_extra={"examples": [{"version": 1}]})
+
+    version: int | str = Field(description="Number, channel or `latest`; kept as the number.")
+    activate_at: datetime | None = Field(
+        None, description="RFC 3339 time with zone at which the channel moves; left out: now."
+    )
+
+
+class TokenBody(In):
+    """A new token."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={
+            "examples": [{"name": "mower-3", "role": "robot", "environments": "farm*", "robot": "mower-3"}]
+        },
+    )
+
+    name: str = Field(min_length=1, max_length=200, description="Who it is for; it stands as author in the history.")
+    role: Literal["viewer", "robot", "editor", "admin"]
+    environments: str | None = Field(
+        None, min_length=1, max_length=200, description="Name pattern (`farm-*`) of the environments it reaches."
+    )
+    robot: str | None = Field(None, min_length=1, max_length=200, description="The robot whose status it may set.")
+    expires: datetime | None = Field(None, description="RFC 3339 time with zone; left out: never.")
+
+
+# --- answers ---
+
+
+class DatumOut(BaseModel):
+    """The local origin."""
+
+    latitude: float
+    longitude: float
+    altitude: float
+    heading: float
+
+
+class EnvironmentOut(BaseModel):
+    """An environment as it is now. ``bounds``: west, south, east, north."""
+
+    name: str
+    title: str
+    description: str
+    tags: list[str]
+    version: int
+    root: str
+    datum: DatumOut | None
+    bounds: list[float] | None
+    created: datetime
+    updated: datetime
+    deleted: datetime | None = None
+
+
+class ProblemItem(BaseModel):
+    """One thing that is wrong or doubtful, and where."""
+
+    problem: str
+    file: str | None = None
+    line: int | None = None
+    where: str | None = None
+
+
+class ProblemOut(BaseModel):
+    """RFC 9457."""
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    errors: list[ProblemItem] | None = None
+
+
+class SourceOut(BaseModel):
+    """An uploaded file. ``used``: whether the version was made from it."""
+
+    name: str
+    size: int
+    sha256: str
+    format: str | None
+    used: bool
+
+
+class VersionOut(BaseModel):
+    """An immutable state. A dry run has ``version: null``."""
+
+    environment: str
+    version: int | None
+    root: str
+    parent: int | None
+    author: str
+    message: str
+    time: datetime | None
+    changes: dict[str, Any]
+    sources: list[SourceOut]
+    warnings: list[ProblemItem]
+    information: dict[str, str]
+
+
+class LayerOut(BaseModel):
+    """One part of a version's content."""
+
+    layer: str
+    level: str
+    name: str
+    count: int
+    hash: str
+    bounds: dict[str, list[float] | None]
+    information: str
+    format: str | None = None
+    sources: list[str]
+    attribution: list[str]
+
+
+class CoverageOut(BaseModel):
+    """Whether a format can be had, by which steps, and else what to supply."""
+
+    format: str
+    state: Literal["direct", "derivable", "missing"]
+    chain: list[dict[str, Any]]
+    missing: list[str]
+
+
+class ReportOut(BaseModel):
+    """What a map is made of and what was lost on the way."""
+
+    format: str
+    version: int
+    layers: list[dict[str, Any]]
+    template: list[dict[str, Any]]
+    dropped: list[dict[str, Any]]
+    warnings: list[ProblemItem]
+
+
+class ChannelOut(BaseModel):
+    """A movable name for a version."""
+
+    channel: str
+    version: int | None
+    root: str | None
+    sequence: int
+    author: str
+    time: datetime
+    planned: dict[str, Any] | None = None
+
+
+class TransformOut(BaseModel):
+    """One place in both frames."""
+
+    latlon: list[float]
+    xy: list[float]
+    datum: DatumOut
+
+
+class FormatOut(BaseModel):
+    """A file format; ``options`` are the parameters of its maps (and of reading it, with ``for: read``)."""
+
+    id: str
+    title: str
+    files: list[str]
+    media_types: list[str]
+    read: bool
+    write: bool
+    options: list[dict[str, Any]]
+    information: dict[str, str]
+
+
+class JobOut(BaseModel):
+    """Work that takes long."""
+
+    id: str
+    state: Literal["queued", "running", "done", "failed", "cancelled"]
+    progress: float
+    detail: str
+    result: dict[str, Any] | None = None
+    problem: ProblemOut | None = None
+    created: datetime
+    updated: datetime
+
+
+class TokenOut(BaseModel):
+    """A token without its secret."""
+
+    id: str
+    name: str
+    role: str
+    environments: str | None
+    robot: str | None
+    expires: datetime | None
+    created: datetime
+
+
+class NewTokenOut(TokenOut):
+    """A new token with its secret, which is told only now."""
+
+    token: str
+
+
+class DiffOut(BaseModel):
+    """What differs between two versions."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    from_: int = Field(alias="from")
+    to: int
+    layers: dict[str, Any]
+
+
+# --- parameters ---
+
+EnvironmentPath = Annotated[
+    str, Path(pattern=NAME, description="An environment's name.", examples=["farm"], max_length=63)
+]
+VersionPath = Annotated[
+    str,
+    Path(
+        pattern=r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62})$",
+        description="Number, channel, or `latest`.",
+        examples=["latest"],
+    ),
+]
+ChannelPath = Annotated[str, Path(pattern=CHANNEL, description="A channel's name.", examples=["production"])]
+FormatPath = Annotated[
+    str, Path(max_length=64, description="A format's id; see `GET /api/v1/formats`.", examples=["geojson"])
+]
+JobPath = Annotated[str, Path(max_length=100, description="A job's id.")]
+TokenPath = Annotated[str, Path(max_length=100, description="A token's id.")]
+LayerPath = Annotated[
+    Literal["location", "objects", "topology", "occupancy", "voxels", "imagery", "zones"],
+    Path(description="A layer.", examples=["topology"]),
+]
+Limit = Annotated[int, Query(ge=1, le=1000, description="Items on a page.")]
+Cursor = Annotated[
+    str | None, Query(max_length=500, description="Where the page starts: taken from the last page's `Link` header.")
+]
+IfMatch = Annotated[
+    str | None,
+    Header(
+        alias="If-Match",
+        max_length=2000,
+        description='The version that the change builds on, as `"3"`, `"<root>"` or `*`; 412 where the head has moved.',
+    ),
+]
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        max_length=255,
+        description="A text of your choice; the same request sent again with it gets the same answer, and never makes "
+        "a second version.",
+    ),
+]
+
+
+def told(model: Any, *statuses: int, ok: int = 200, description: str = "OK") -> dict[int | str, dict[str, Any]]:
+    """OpenAPI's responses: the good one by its shape, and which problems this call can meet besides the usual ones."""
+    reasons = {
+        400: "The body is malformed.",
+        404: "There is no such thing.",
+        406: "None of the accepted media types can be served.",
+        409: "It does not fit the present state, or several things fit and none was named.",
+        412: "The head has moved.",
+        413: "Larger than the server takes.",
+        415: "A media type or content coding that is not taken.",
+        416: "The range lies outside of the file.",
+        422: "The request, a file, or what is stored does not allow it; `errors` says where.",
+        503: "Too busy, or a part of the server does not answer: try again after `Retry-After` seconds.",
+    }
+    out: dict[int | str, dict[str, Any]] = {}
+    if model is not None:
+        out[ok] = {"model": model, "description": description}
+    problem = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    for status in statuses:
+        out[status] = {"description": reasons[status], "content": problem}
+    return out

@@ -1,0 +1,62 @@
+"""What routes work with: one object at ``app.state.services``, made when the server starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from fastapi import Depends, Request
+
+from app.api.access import Access
+from app.convert import Maps
+from app.formats import Limits
+from app.ingest import Ingest
+from app.pool import Pool
+from app.store import Store
+
+if TYPE_CHECKING:
+    from app.api.jobs import Work
+    from app.api.maps import Hot
+    from app.api.metrics import Metrics
+    from app.api.uploads import Intake
+
+
+@dataclass(frozen=True, slots=True)
+class ApiOptions:
+    """What an operator can set of the API. Times in seconds, sizes in bytes; see ``app.config``."""
+
+    limits: Limits
+    spool_dir: Path
+    job_seconds: float = 20.0
+    max_json_bytes: int = 64 * 2**20
+    max_uploads: int = 8
+    body_seconds: float = 30.0
+    token_failures: int = 20
+    memory_cache_bytes: int = 128 * 2**20
+    insecure_no_auth: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Services:
+    """The parts of the server that routes use."""
+
+    options: ApiOptions
+    store: Store
+    pool: Pool
+    ingest: Ingest
+    maps: Maps
+    access: Access
+    work: Work
+    hot: Hot
+    intake: Intake
+    metrics: Metrics
+
+
+async def services(request: Request) -> Services:
+    """The services of the application that answers this request."""
+    found: Services = request.app.state.services
+    return found
+
+
+Here = Annotated[Services, Depends(services)]

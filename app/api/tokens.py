@@ -1,0 +1,77 @@
+"""Access tokens."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from fastapi import APIRouter
+from starlette.responses import Response
+
+from app.api.access import Admin
+from app.api.answers import Route, answer
+from app.api.schemas import NewTokenOut, TokenBody, TokenOut, TokenPath, told
+from app.api.services import Here
+from app.errors import Conflict, Invalid, NotFound, Problem
+from app.store.values import Token, rfc3339
+
+router = APIRouter(prefix="/tokens", tags=["tokens"], route_class=Route)
+
+
+def as_dict(token: Token) -> dict[str, Any]:
+    """The token without its secret."""
+    return {
+        "id": token.id,
+        "name": token.name,
+        "role": token.role,
+        "environments": token.environments,
+        "robot": token.robot,
+        "expires": rfc3339(token.expires) if token.expires else None,
+        "created": rfc3339(token.created),
+    }
+
+
+@router.get("", responses=told(list[TokenOut]), summary="All tokens, without their secrets")
+def list_tokens(here: Here, who: Admin) -> Response:
+    """Oldest first."""
+    who.demand_everywhere()
+    return answer([as_dict(token) for token in here.store.tokens()])
+
+
+@router.post(
+    "",
+    status_code=201,
+    responses=told(NewTokenOut, 400, 415, ok=201, description="Made"),
+    summary="Make a token",
+)
+def create_token(body: TokenBody, here: Here, who: Admin) -> Response:
+    """Its secret stands in this answer and nowhere else: only its hash is stored."""
+    who.demand_everywhere()
+    if body.expires is not None:
+        if body.expires.tzinfo is None:
+            raise Invalid("expires needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="expires")])
+        if body.expires <= datetime.now(UTC):
+            raise Invalid("expires is in the past", [Problem("past", where="expires")])
+    if body.robot is not None and body.role != "robot":
+        raise Invalid("only a token with the role robot names a robot", [Problem("role is not robot", where="robot")])
+    token, secret = here.store.create_token(body.name, body.role, body.environments, body.robot, body.expires)
+    return answer({**as_dict(token), "token": secret}, 201, {"cache-control": "no-store"})
+
+
+@router.delete("/{id}", status_code=204, responses=told(None, 404, 409), summary="Revoke a token")
+def delete_token(id: TokenPath, here: Here, who: Admin) -> Response:
+    """It is refused from now on (within a second by other worker processes). The last administrator's stays."""
+    who.demand_everywhere()
+    known = {token.id: token for token in here.store.tokens()}
+    if id not in known:
+        raise NotFound("there is no token with this id")
+    if _rules_all(known[id]) and not any(_rules_all(t) for t in known.values() if t.id != id):
+        raise Conflict("this is the last administrator's token: make another one first")
+    here.store.delete_token(id)
+    here.access.forget()
+    return Response(status_code=204)
+
+
+def _rules_all(token: Token) -> bool:
+    """Whether it is an administrator's for everything, and for good."""
+    return token.role == "admin" and token.environments is None and token.expires is None

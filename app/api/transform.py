@@ -1,0 +1,74 @@
+"""Between earth and the local frame."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, Query
+from starlette.responses import Response
+
+from app.api.access import Viewer
+from app.api.answers import Route, answer
+from app.api.environments import numbers
+from app.api.maps import number_of
+from app.api.schemas import EnvironmentPath, TransformOut, told
+from app.api.services import Here
+from app.errors import Invalid, MissingDatum, Problem
+from app.model.frame import MAX_METRES
+from app.model.geodesy import local_frame
+
+router = APIRouter(prefix="/environments/{env}", tags=["transform"], route_class=Route)
+
+
+FAR = "the place is too far from the datum for the local frame"
+
+
+def _refused(where: str, detail: str) -> Invalid:
+    return Invalid(detail, [Problem(detail, where=where)])
+
+
+@router.get("/transform", responses=told(TransformOut, 404), summary="Between earth and local frame")
+def transform(
+    env: EnvironmentPath,
+    here: Here,
+    _: Viewer,
+    latlon: Annotated[
+        str | None, Query(description="`LAT,LON` in degrees (WGS 84).", examples=["53.2687,-0.5244"])
+    ] = None,
+    xy: Annotated[str | None, Query(description="`X,Y` in metres of the local frame.")] = None,
+    version: Annotated[
+        str, Query(pattern=r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62})$", description="Whose datum is meant.")
+    ] = "latest",
+) -> Response:
+    """Give ``latlon`` or ``xy``; the answer has both. Numbers are rounded to 1e-12 degrees and 1e-9 metres."""
+    if (latlon is None) == (xy is None):
+        raise Invalid("give either latlon=LAT,LON or xy=X,Y", [Problem("one of latlon and xy", where="query")])
+    datum = here.store.version(env, number_of(version)).datum
+    if datum is None:
+        raise MissingDatum(f'{env} has no datum: PATCH it with {{"datum": {{…}}}} or upload a datum.yaml')
+    frame = local_frame(datum)
+    if latlon is not None:
+        latitude, longitude = numbers(latlon, "latlon", "LAT,LON")
+        if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
+            raise _refused("latlon", "latlon must be LAT,LON in degrees: the latitude comes first")
+        lonlat = np.array([[longitude, latitude]])
+        place = frame.to_local(lonlat)
+        if not (np.isfinite(place).all() and (np.abs(place) <= MAX_METRES).all()):
+            raise _refused("latlon", FAR)
+    else:
+        x, y = numbers(xy or "", "xy", "X,Y")
+        if max(abs(x), abs(y)) > MAX_METRES:
+            raise _refused("xy", f"x and y must be within ±{MAX_METRES:g} metres")
+        place = np.array([[x, y]])
+        lonlat = frame.to_wgs84(place)
+        if not np.isfinite(lonlat).all():
+            raise _refused("xy", FAR)
+    degrees, metres = np.round(lonlat[0], 12) + 0.0, np.round(place[0], 9) + 0.0
+    return answer(
+        {
+            "latlon": [float(degrees[1]), float(degrees[0])],
+            "xy": [float(metres[0]), float(metres[1])],
+            "datum": datum.as_dict(),
+        }
+    )

@@ -1,0 +1,256 @@
+"""Multipart uploads, streamed to disk while they arrive: counted, hashed, bounded.
+
+A file's name may be a relative path and is kept as it was given; on disk it never names anything. Files lie in a
+folder of their own below the spool, which goes with the request; what a killed server left is removed at the next
+start (``Intake``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import shutil
+import threading
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+from uuid import uuid4
+
+from fastapi import Request
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.concurrency import run_in_threadpool
+
+from app.api.guard import multipart_boundary
+from app.api.problems import MalformedBody
+from app.errors import Invalid, Problem, TooLarge, Unavailable
+from app.formats import Limits
+from app.ingest import SpooledFile
+
+BATCH = 2**20
+"""Bytes gathered before a thread parses, hashes and writes them."""
+
+MAX_FIELD = 64 * 2**10
+MAX_FIELDS = 100
+MAX_HEADERS = 8
+MAX_HEADER = 8 * 2**10
+
+FILES = "files"
+
+
+@dataclass(slots=True)
+class Form:
+    """What was sent: files in order, and the other fields."""
+
+    files: list[SpooledFile] = field(default_factory=list)
+    fields: dict[str, str] = field(default_factory=dict)
+
+
+class Intake:
+    """Where uploads arrive: so many at once, and nothing of a dead process stays."""
+
+    def __init__(self, spool: Path, limits: Limits, *, at_once: int) -> None:
+        self._limits, self._at_once = limits, at_once
+        self._active = 0
+        self._lock = threading.Lock()
+        spool.mkdir(parents=True, exist_ok=True)
+        _remove_left(spool)
+        self._folder = spool / uuid4().hex
+        self._folder.mkdir()
+        # Held as long as this process lives: how the next start knows what is left over.
+        self._alive = (self._folder / "alive").open("w")
+        fcntl.flock(self._alive, fcntl.LOCK_EX)
+
+    def close(self) -> None:
+        """Remove the spool of this process."""
+        self._alive.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    @contextlib.asynccontextmanager
+    async def take(self, request: Request) -> AsyncIterator[Form]:
+        """The form of a multipart request; its files last as long as the block.
+
+        Raises Unavailable (too many uploads at once), MalformedBody, Invalid, TooLarge.
+        """
+        with self._lock:
+            if self._active >= self._at_once:
+                raise Unavailable("too many uploads arrive at the moment: try again in a few seconds")
+            self._active += 1
+        folder = self._folder / uuid4().hex
+        try:
+            boundary = multipart_boundary(request.headers.get("content-type", ""))
+            folder.mkdir()
+            receiver = _Receiver(boundary, folder, self._limits)
+            try:
+                await _feed(request, receiver)
+            finally:
+                receiver.close()
+            yield receiver.form
+        finally:
+            with self._lock:
+                self._active -= 1
+            await run_in_threadpool(shutil.rmtree, folder, True)
+
+
+async def _feed(request: Request, receiver: _Receiver) -> None:
+    batch: list[bytes] = []
+    size = 0
+    async for chunk in request.stream():
+        batch.append(chunk)
+        size += len(chunk)
+        if size >= BATCH:
+            await run_in_threadpool(receiver.write, b"".join(batch))
+            batch, size = [], 0
+    await run_in_threadpool(receiver.finish, b"".join(batch))
+
+
+def _remove_left(spool: Path) -> None:
+    """Remove the folders of processes that are no more: nobody holds their lock."""
+    for folder in spool.iterdir():
+        try:
+            with (folder / "alive").open("r+") as handle:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
+        except BlockingIOError:
+            continue
+        except OSError:
+            # No lock file: it died while it started, or another start is just removing it.
+            if folder.is_dir() and not any(folder.iterdir()):
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
+
+
+class _Receiver:
+    """The parts of one body: files to disk, fields to memory."""
+
+    def __init__(self, boundary: bytes, folder: Path, limits: Limits) -> None:
+        self.form = Form()
+        self._folder, self._limits = folder, limits
+        self._total = 0
+        self._ended = False
+        self._header_name, self._header_value = bytearray(), bytearray()
+        self._disposition = b""
+        self._file: IO[bytes] | None = None
+        self._file_name = ""
+        self._file_size = 0
+        self._hash = hashlib.sha256()
+        self._field: str | None = None
+        self._value = bytearray()
+        callbacks: dict[str, Callable[..., Any]] = {
+            "on_part_begin": self._part_begin,
+            "on_header_field": lambda data, start, end: self._header_name.extend(data[start:end]),
+            "on_header_value": lambda data, start, end: self._header_value.extend(data[start:end]),
+            "on_header_end": self._header_end,
+            "on_headers_finished": self._part_starts,
+            "on_part_data": self._part_data,
+            "on_part_end": self._part_end,
+            "on_end": self._end,
+        }
+        self._parser = MultipartParser(
+            boundary,
+            callbacks,  # type: ignore[arg-type]
+            max_header_count=MAX_HEADERS,
+            max_header_size=MAX_HEADER,
+        )
+
+    def write(self, data: bytes) -> None:
+        """The next bytes of the body."""
+        try:
+            self._parser.write(data)
+        except FormParserError as error:
+            raise MalformedBody(f"the multipart body cannot be read: {error}") from error
+
+    def finish(self, data: bytes) -> None:
+        """The last bytes of the body: it must be complete."""
+        self.write(data)
+        if not self._ended:
+            raise MalformedBody("the multipart body ends before its closing boundary: it was cut off on its way")
+
+    def close(self) -> None:
+        """Let go of a file that was not finished."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _part_begin(self) -> None:
+        self._disposition = b""
+        self._header_name.clear()
+        self._header_value.clear()
+
+    def _header_end(self) -> None:
+        name, value = bytes(self._header_name).lower(), bytes(self._header_value)
+        if name == b"content-disposition":
+            self._disposition = value
+        plain = value.strip().lower() in (b"binary", b"8bit", b"7bit")
+        if name == b"content-transfer-encoding" and not plain:
+            raise MalformedBody("parts are taken as they are: send them without Content-Transfer-Encoding")
+        self._header_name.clear()
+        self._header_value.clear()
+
+    def _part_starts(self) -> None:
+        kind, options = parse_options_header(self._disposition.decode("latin-1"))
+        if kind != b"form-data" or b"name" not in options:
+            raise MalformedBody("each part needs Content-Disposition: form-data; name=…")
+        name = _text(options[b"name"], "field name")
+        file_name = options.get(b"filename")
+        if file_name is None and name != FILES:
+            if len(self.form.fields) >= MAX_FIELDS:
+                raise TooLarge(f"the form has more than {MAX_FIELDS} fields")
+            if name in self.form.fields:
+                raise Invalid(f"the field {name!r} is given twice", [Problem("given twice", where=name)])
+            self._field, self._value = name, bytearray()
+            return
+        if name != FILES:
+            raise Invalid(
+                f"files are sent in the field '{FILES}', not {name[:80]!r}", [Problem("not a file field", where=name)]
+            )
+        if not file_name:
+            raise Invalid("a file needs a name: filename=… in its Content-Disposition")
+        if len(self.form.files) >= self._limits.files:
+            raise TooLarge(f"the upload has more than {self._limits.files} files, the most that this server takes")
+        self._file_name = _text(file_name, "file name")
+        self._file_size, self._hash = 0, hashlib.sha256()
+        self._file = (self._folder / str(len(self.form.files))).open("wb")
+
+    def _part_data(self, data: bytes, start: int, end: int) -> None:
+        if self._file is not None:
+            self._total += end - start
+            if self._total > self._limits.upload_bytes:
+                raise TooLarge(
+                    f"the files are larger than {self._limits.upload_bytes} bytes, the most that this server takes"
+                )
+            chunk = memoryview(data)[start:end]
+            self._file.write(chunk)
+            self._hash.update(chunk)
+            self._file_size += end - start
+        elif self._field is not None:
+            self._value += data[start:end]
+            if len(self._value) > MAX_FIELD:
+                raise TooLarge(f"the field {self._field[:80]!r} is longer than {MAX_FIELD} bytes")
+
+    def _part_end(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            path = Path(os.fspath(self._file.name))
+            self._file = None
+            self.form.files.append(SpooledFile(self._file_name, path, self._file_size, self._hash.hexdigest()))
+        elif self._field is not None:
+            self.form.fields[self._field] = _text(bytes(self._value), f"field {self._field[:80]!r}")
+            self._field = None
+
+    def _end(self) -> None:
+        self._ended = True
+
+
+def _text(data: bytes, what: str) -> str:
+    """UTF-8 without a NUL; Invalid says which part of the form is not."""
+    try:
+        text = data.decode()
+    except UnicodeDecodeError:
+        raise Invalid(f"a {what} of the form is not UTF-8") from None
+    if "\0" in text:
+        raise Invalid(f"a {what} of the form has a NUL character")
+    return text

@@ -1,0 +1,209 @@
+"""The settings: environment variables ``FLEETMAP_*``, a ``.env`` file, or flags of ``fleetmap serve``.
+
+Nothing is read at import: a factory makes ``Settings()`` and passes it on. Every setting is described here and in the
+README; every field of ``app.formats.Limits`` is the setting ``FLEETMAP_MAX_<FIELD>``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import ipaddress
+import os
+from pathlib import Path
+from typing import Any, Literal, Self
+from urllib.parse import unquote, urlsplit
+
+from pydantic import Field, SecretStr, field_validator, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from app.formats import Limits
+
+_DEFAULTS = Limits()
+
+
+class Settings(BaseSettings):
+    """Everything an operator can set. Sizes are bytes, times are seconds."""
+
+    model_config = SettingsConfigDict(env_prefix="FLEETMAP_", env_file=".env", extra="ignore", frozen=True)
+
+    data_dir: Path = Field(
+        default=Path("data"),
+        description="Folder for the database, the stored files and the cache; made where it is absent.",
+    )
+    database_url: str | None = Field(
+        default=None,
+        description="Database: `postgresql+psycopg://user:password@host/name` (with PostGIS), or a `sqlite:///…` file. "
+        "Default: an SQLite file in the data folder.",
+    )
+    blob_url: str | None = Field(
+        default=None,
+        description="Where uploaded files are kept: a folder, as a path or `file://` address. Default: `blobs` in the "
+        "data folder. All workers must see the same folder.",
+    )
+    host: str = Field(default="127.0.0.1", description="Address to listen on; `0.0.0.0` for all of the machine's.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on.")
+    workers: int = Field(default=1, ge=1, le=256, description="Processes that answer requests.")
+    admin_token: SecretStr | None = Field(
+        default=None,
+        min_length=8,
+        description="A first administrator's token, for containers and tests; use 32 random characters or more. "
+        "Without it the first start makes one and prints it once.",
+    )
+    insecure_no_auth: bool = Field(
+        default=False,
+        description="Let everybody do everything without a token. Works only while listening on a loopback address.",
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(default="info", description="How much is logged.")
+
+    conversion_workers: int = Field(
+        default_factory=lambda: max(1, min(8, os.cpu_count() or 1)),
+        ge=1,
+        le=256,
+        description="Processes that read uploads and make maps, for each of the workers. Default: the number of "
+        "processors, at most 8.",
+    )
+    conversion_queue: int = Field(
+        default=64,
+        ge=1,
+        le=10_000,
+        description="Conversions that may wait for a free process; further ones are answered 503.",
+    )
+    job_seconds: float = Field(
+        default=20.0,
+        gt=0,
+        le=3600,
+        description="A map that takes longer than this is answered 202 with the address of a job.",
+    )
+    cache_bytes: int = Field(
+        default=4 * 2**30,
+        ge=0,
+        description="Room for finished maps in the data folder; the longest unused are given up first.",
+    )
+    memory_cache_bytes: int = Field(
+        default=128 * 2**20, ge=0, description="Room for finished maps in the memory of each worker."
+    )
+
+    max_uploads: int = Field(
+        default=8, ge=1, le=1000, description="Uploads that one worker takes in at once; further ones are answered 503."
+    )
+    max_json_bytes: int = Field(
+        default=64 * 2**20, ge=1024, description="Largest request body that is not a file upload (edits, for instance)."
+    )
+    header_seconds: float = Field(
+        default=20.0, gt=0, le=3600, description="Time in which a client must have sent a request's head."
+    )
+    body_seconds: float = Field(
+        default=30.0,
+        gt=0,
+        le=3600,
+        description="Longest pause while a client sends a body; on the whole it must send at least 1 kB a second.",
+    )
+    token_failures: int = Field(
+        default=20, ge=1, le=10_000, description="Wrong tokens a minute from one address before it is answered 429."
+    )
+
+    max_upload_bytes: int = Field(
+        default=_DEFAULTS.upload_bytes, ge=1, description="Largest upload: the sum of all files of one request."
+    )
+    max_unpacked_bytes: int = Field(
+        default=_DEFAULTS.unpacked_bytes, ge=1, description="Most that the archives of one upload may unfold to."
+    )
+    max_files: int = Field(default=_DEFAULTS.files, ge=1, description="Most files in one upload or archive.")
+    max_pixels: int = Field(default=_DEFAULTS.pixels, ge=1, description="Most pixels or cells of one picture or grid.")
+    max_features: int = Field(
+        default=_DEFAULTS.features, ge=1, description="Most nodes, edges and objects of one file."
+    )
+    max_yaml_depth: int = Field(
+        default=_DEFAULTS.yaml_depth, ge=4, le=500, description="Deepest nesting of a YAML file."
+    )
+    max_yaml_nodes: int = Field(
+        default=_DEFAULTS.yaml_nodes,
+        ge=1,
+        description="Most values of a YAML file, aliases counted as often as they are used.",
+    )
+    max_xml_attribute_bytes: int = Field(
+        default=_DEFAULTS.xml_attribute_bytes, ge=256, description="Longest attribute of an XML file."
+    )
+    max_text_bytes: int = Field(
+        default=_DEFAULTS.text_bytes, ge=1, description="Largest single text file (YAML, XML, JSON)."
+    )
+    max_seconds: float = Field(
+        default=_DEFAULTS.seconds, gt=0, description="Longest time for reading or making one map."
+    )
+    max_memory_bytes: int = Field(
+        default=_DEFAULTS.memory_bytes,
+        ge=2**29,
+        description="Address space of a process that reads uploads and makes maps.",
+    )
+    max_warnings: int = Field(default=_DEFAULTS.warnings, ge=1, description="Most warnings kept with one version.")
+
+    @field_validator("database_url", "blob_url", "admin_token", mode="before")
+    @classmethod
+    def _empty_is_unset(cls, value: Any) -> Any:
+        return None if value == "" else value
+
+    @field_validator("blob_url")
+    @classmethod
+    def _is_folder(cls, value: str | None) -> str | None:
+        if value is not None and "://" in value and not value.startswith("file://"):
+            raise ValueError("only folders are supported: give a path or a file:// address")
+        return value
+
+    @model_validator(mode="after")
+    def _no_auth_only_on_loopback(self) -> Self:
+        if self.insecure_no_auth and not is_loopback(self.host):
+            raise ValueError(
+                f"insecure_no_auth works only while listening on a loopback address, not on {self.host}: "
+                "listen on 127.0.0.1, or leave it out and use tokens"
+            )
+        return self
+
+    @property
+    def limits(self) -> Limits:
+        """The limits of the read boundary."""
+        names = [f.name for f in dataclasses.fields(Limits)]
+        return Limits(**{name: getattr(self, f"max_{name}") for name in names})
+
+    @property
+    def database(self) -> str:
+        """The database's URL, the default filled in."""
+        return self.database_url or f"sqlite:///{self.data_dir.resolve() / 'fleetmap.sqlite3'}"
+
+    @property
+    def blob_dir(self) -> Path:
+        """The folder of uploaded files, the default filled in."""
+        if self.blob_url is None:
+            return self.data_dir / "blobs"
+        if self.blob_url.startswith("file://"):
+            return Path(unquote(urlsplit(self.blob_url).path))
+        return Path(self.blob_url)
+
+    @property
+    def cache_dir(self) -> Path:
+        """The folder of finished maps."""
+        return self.data_dir / "cache"
+
+    @property
+    def spool_dir(self) -> Path:
+        """The folder of uploads on their way in."""
+        return self.data_dir / "spool"
+
+    def as_environment(self) -> dict[str, str]:
+        """The settings as environment variables, for worker processes; unset ones are left out."""
+        out = {}
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            if value is not None:
+                text = value.get_secret_value() if isinstance(value, SecretStr) else str(value)
+                out[f"FLEETMAP_{name.upper()}"] = text
+        return out
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address to listen on is reached from this machine alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False

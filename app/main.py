@@ -1,0 +1,267 @@
+"""The server: one application made of the store, the pool, the services and the API, and how uvicorn runs it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import logging
+import os
+import shutil
+import sys
+from collections.abc import AsyncIterator, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from fastapi import APIRouter, FastAPI
+from fastapi.exceptions import RequestValidationError
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+
+from app import __version__
+from app.api import (
+    channels,
+    convert,
+    diff,
+    environments,
+    formats,
+    health,
+    jobs,
+    layers,
+    maps,
+    openapi,
+    problems,
+    tokens,
+    transform,
+    versions,
+)
+from app.api.access import Access
+from app.api.answers import API
+from app.api.guard import Guard
+from app.api.jobs import BEAT_SECONDS, Work
+from app.api.maps import Front, Hot
+from app.api.metrics import Metrics
+from app.api.protocol import BoundedProtocol
+from app.api.services import ApiOptions, Services
+from app.api.uploads import Intake
+from app.config import Settings
+from app.convert import Maps
+from app.errors import FleetMapError, Unavailable
+from app.ingest import Ingest
+from app.pool import Pool
+from app.store import Store
+
+log = logging.getLogger(__name__)
+
+TICK_SECONDS = 1.0
+"""How late a planned move of a channel may come."""
+
+COLLECT_EVERY = timedelta(hours=24)
+COLLECT_GRACE = timedelta(hours=6)
+"""Data that nothing refers to is removed once a day, unless it is younger than this (an upload may be using it)."""
+
+WARM = ("app.ingest.prepare", "app.convert.make", "app.convert.files")
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """The application. Its lifespan opens the store and starts the workers, and closes both."""
+
+    @contextlib.asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        here = await run_in_threadpool(open_services, settings)
+        app.state.services = here
+        ticker = asyncio.create_task(_tick(here))
+        try:
+            yield
+        finally:
+            ticker.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await ticker
+            await run_in_threadpool(close_services, here)
+
+    app = FastAPI(
+        title="Fleet Map Server",
+        version=__version__,
+        lifespan=lifespan,
+        openapi_url=None,
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+    )
+    app.add_exception_handler(FleetMapError, problems.handle_error)
+    app.add_exception_handler(HTTPException, problems.handle_http)
+    app.add_exception_handler(RequestValidationError, problems.handle_validation)
+    app.add_middleware(Guard)
+    app.add_middleware(Front)  # added last: it stands in front
+    maps.add_routes(app)
+    openapi.add_pages(app)
+    api = APIRouter(prefix=API)
+    for module in (environments, versions, layers, maps, diff, channels, transform, formats, convert, jobs, tokens):
+        api.include_router(module.router)
+    app.include_router(api)
+    app.include_router(health.router)
+    return app
+
+
+def from_environment() -> FastAPI:
+    """For ``uvicorn --factory app.main:from_environment`` and for worker processes."""
+    return create_app(Settings())
+
+
+def server_config(settings: Settings, app: Any = "app.main:from_environment", **more: Any) -> uvicorn.Config:
+    """uvicorn as this server needs it: fast loop and parser, bounded heads, no access log, no version in headers.
+
+    app: an application, or the import string of a factory (needed for several workers, who read the settings from the
+    environment: ``os.environ.update(settings.as_environment())`` first).
+    """
+    if settings.workers > 1:
+        folder = settings.data_dir / "metrics"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        os.environ["PROMETHEUS_MULTIPROC_DIR"] = str(folder.resolve())
+    options: dict[str, Any] = {
+        "factory": isinstance(app, str),
+        "host": settings.host,
+        "port": settings.port,
+        "workers": settings.workers,
+        "http": BoundedProtocol,
+        "loop": "uvloop" if _has_uvloop() else "auto",
+        "ws": "none",
+        "lifespan": "on",
+        "log_level": settings.log_level,
+        "access_log": False,
+        "server_header": False,
+        "timeout_keep_alive": 30,
+        "timeout_graceful_shutdown": 20,
+    }
+    config = uvicorn.Config(app, **{**options, **more})
+    config.head_seconds = settings.header_seconds  # type: ignore[attr-defined]  # read by BoundedProtocol
+    return config
+
+
+def _has_uvloop() -> bool:
+    try:
+        import uvloop  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def open_services(settings: Settings) -> Services:
+    """Open the store and start the workers. Blocks. Raises Unavailable where the database is not this release's."""
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    settings.blob_dir.mkdir(parents=True, exist_ok=True)
+    store = Store(settings.database, settings.blob_dir)
+    pool: Pool | None = None
+    try:
+        with _alone(settings.data_dir):
+            if settings.database.startswith("sqlite"):
+                store.migrate()
+            try:
+                store.check()
+            except Unavailable as error:
+                hint = (
+                    "" if settings.database.startswith("sqlite") else " (`fleetmap migrate` makes the schema current)"
+                )
+                raise Unavailable(error.detail + hint) from error
+            store.recover()
+            if not settings.insecure_no_auth:
+                _first_token(store, settings)
+            intake = Intake(settings.spool_dir, settings.limits, at_once=settings.max_uploads)
+        pool = Pool(
+            settings.conversion_workers,
+            memory_bytes=settings.max_memory_bytes,
+            seconds=settings.max_seconds,
+            waiting=settings.conversion_queue,
+            warm=WARM,
+        )
+        return _services(settings, store, pool, intake)
+    except BaseException:
+        if pool is not None:
+            pool.close()
+        store.close()
+        raise
+
+
+def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> Services:
+    metrics = Metrics()
+    service = Maps(store, pool.run, settings.cache_dir, settings.limits, cache_bytes=settings.cache_bytes)
+    access = Access(store.find_token, failures=settings.token_failures, insecure=settings.insecure_no_auth)
+
+    def count(name: str, result: str) -> None:
+        metrics.conversions.labels(name, result).inc()
+
+    return Services(
+        options=ApiOptions(
+            limits=settings.limits,
+            spool_dir=settings.spool_dir,
+            job_seconds=settings.job_seconds,
+            max_json_bytes=settings.max_json_bytes,
+            max_uploads=settings.max_uploads,
+            body_seconds=settings.body_seconds,
+            token_failures=settings.token_failures,
+            memory_cache_bytes=settings.memory_cache_bytes,
+            insecure_no_auth=settings.insecure_no_auth,
+        ),
+        store=store,
+        pool=pool,
+        ingest=Ingest(store, pool.run, settings.limits),
+        maps=service,
+        access=access,
+        work=Work(store, service, settings.job_seconds, count),
+        hot=Hot(settings.memory_cache_bytes, access, metrics, store.generation),
+        intake=intake,
+        metrics=metrics,
+    )
+
+
+def close_services(here: Services) -> None:
+    """End workers, remove the spool, close the store. Blocks."""
+    here.pool.close()
+    here.work.close()
+    here.intake.close()
+    here.store.close()
+
+
+@contextlib.contextmanager
+def _alone(data_dir: Path) -> Iterator[None]:
+    """One process at a time starts on a data folder: migrations, leftovers and the first token are done once."""
+    with (data_dir / "start.lock").open("w") as handle:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+
+
+def _first_token(store: Store, settings: Settings) -> None:
+    """Make sure that somebody can come in."""
+    if settings.admin_token is not None:
+        text = settings.admin_token.get_secret_value()
+        if len(text) < 22:
+            log.warning("FLEETMAP_ADMIN_TOKEN is short: anybody could guess it. Use 32 random characters")
+        if store.find_token(text) is None:
+            store.create_token("administrator", "admin", token=text)
+    elif not any(token.role == "admin" for token in store.tokens()):
+        _, text = store.create_token("administrator", "admin")
+        print(f"administrator's token, shown only this once: {text}", file=sys.stdout, flush=True)
+
+
+async def _tick(here: Services) -> None:
+    """Planned moves of channels, signs of life of jobs, and the daily clean-up."""
+    beat = 0.0
+    collect = datetime.now(UTC) + COLLECT_EVERY
+    while True:
+        await asyncio.sleep(TICK_SECONDS)
+        beat += TICK_SECONDS
+        try:
+            await run_in_threadpool(here.store.apply_due, datetime.now(UTC))
+            if beat >= BEAT_SECONDS:
+                beat = 0.0
+                await run_in_threadpool(here.work.beat)
+            if datetime.now(UTC) >= collect:
+                collect = datetime.now(UTC) + COLLECT_EVERY
+                await run_in_threadpool(here.store.collect, COLLECT_GRACE)
+        except FleetMapError as error:
+            log.warning("housekeeping waits: %s", error.detail)
+        except Exception as error:  # noqa: BLE001  the ticker must outlive a database that is away for a while
+            log.error("housekeeping failed: %s", problems.describe(error))  # noqa: TRY400  a trace shows paths
