@@ -93,6 +93,8 @@ def scalar(text: str) -> Any:
 
 
 _BARE = re.compile(r"[A-Za-z_$/][\w$/.+|()-]*(?: [\w$/.+|()][\w$/.+|()-]*)*\Z", re.ASCII)
+_JOINTS = str.maketrans(":-.", "___")
+
 _RESERVED = frozenset(word.lower() for word in CONSTANTS) | {"y", "n", "nan", "inf", "infinity"}
 _ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "\0": "\\0"}
 LONGEST_KEY = 200
@@ -101,6 +103,12 @@ LONGEST_KEY = 200
 def text(value: str | float | None) -> str:
     """A scalar as YAML, on one line. Texts are quoted wherever some reader could take them for something else."""
     if isinstance(value, str):
+        # What most names look like: no word that means something else ends with a digit.
+        if value.isascii() and value[-1:].isdigit():
+            if value.isidentifier():
+                return value
+            if value[0] not in "-." and value.translate(_JOINTS).isidentifier():
+                return f"'{value}'"
         if _BARE.match(value) and value.lower() not in _RESERVED:
             return value
         if _QUOTABLE.match(value):

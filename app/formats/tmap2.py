@@ -20,7 +20,7 @@ import math
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -52,6 +52,9 @@ CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME})
 CANONICAL_EDGE = frozenset({"kind", "source", "target", "action", NAME})
 UNWRITTEN = frozenset({"drawn_from"})
 """Canonical properties that speak of other parts of the environment, not of the item."""
+
+BULKY = frozenset({"osm"})
+"""What these formats know of an item is written on demand: OSM's tags and history are larger than all the rest."""
 
 NUMERIC_WORDS = ("speed_limit", "width")
 
@@ -99,6 +102,7 @@ class WriteOptions:
 
     action: str = parameter(ACTION, "action of edges that name none")
     action_type: str = parameter(ACTION_TYPE, "type of that action's goal")
+    osm: bool = parameter(False, "write OpenStreetMap's tags and attributes under properties of nodes and edges")
     pointset: str | None = parameter(
         None, "name of the network and its pointset; default: the source's, else the map's"
     )
@@ -517,7 +521,10 @@ class _Writer:
         self.document = self._document()
         self.turn = _turn(self.document)
         self.legacy = False  # whether the network at hand came as the older list, which lacks much that tmap2 asks for
-        self.templates: dict[bytes, list[str]] = {}
+        self.unwritten = UNWRITTEN if self.options.osm else UNWRITTEN | BULKY
+        # Properties without anything for an item's own ``properties``.
+        self.plain_node, self.plain_edge = CANONICAL_NODE | self.unwritten, CANONICAL_EDGE | self.unwritten
+        self.templates: dict[Any, list[str]] = {}
         self.filled: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
 
@@ -564,9 +571,8 @@ class _Writer:
             why = "tmap2 knows no levels: all networks are joined, 2-D points at their level's elevation"
             self.context.drop("levels of nodes and edges", count, why)
         self._report()
-        listed = "\n" + "".join(text for _, _, text in sorted(nodes)) if nodes else " []\n"
         before, after = _split({**self.document, "nodes": None}, 0, "nodes")
-        return f"{before}{listed}{after}"
+        return f"{before}{_listed(nodes)}{after}"
 
     def _network(self, part: Features, level: str, taken: set[str]) -> Lines:
         """The nodes of a network, each with its edges."""
@@ -575,13 +581,38 @@ class _Writer:
         kinds = [p.get("kind") for p in part.properties]
         places = [k for k, point in enumerate(is_point.tolist()) if point and kinds[k] == "node"]
         names = self._names(part, places, taken)
-        edges = self._edges(part, kinds, names)
+        said = {i: _yaml.text(name) for i, name in names.items()}
+        edges = self._edges(part, kinds, said)
         coordinates = self._positions(part, places, 0.0 if level == GROUND else self.layers.elevation(level))
         out = []
+        plain = self._plain_node()
         for place, at in zip(places, coordinates, strict=True):
-            i = part.ids[place]
-            out.append((len(names[i]), names[i], self._node(part.properties[place], names[i], at, edges.get(i, []))))
+            i, p = part.ids[place], part.properties[place]
+            name = names[i]
+            if self._is_plain(p, self.plain_node) and "orientation" not in p and p.get("name", name) == name:
+                self.filled["nodes"] += 1
+                self.filled["orientations"] += 1
+                text = plain(said[i], _listed(edges[i]), at)
+            else:
+                text = self._node(p, name, said[i], at, edges[i])
+            out.append((len(name), name, text))
         return out
+
+    def _is_plain(self, p: Properties, words: frozenset[str]) -> bool:
+        """Whether an item comes from another format and has nothing for its own ``properties``."""
+        return NAME not in p and not self.legacy and p.keys() <= words
+
+    def _plain_node(self) -> Callable[[str, str, tuple[str, str, str]], str]:
+        """The quick way for nodes that have only a name and a place: (name, edges, position) as texts -> entry."""
+        a, b, c, d, e = self._node_template({}, {}, None, known=False, fill=True)
+        d += self._pose(None, ("\0", "\0", "\0"), [0.0, 0.0, 0.0, 1.0], turned=False)
+        d, y, z, end = d.split("\0")
+        e = end + e
+
+        def plain(said: str, listed: str, at: tuple[str, str, str]) -> str:
+            return f"{a} {said}\n{b}{listed}{c} {said}\n{d}{at[0]}{y}{at[1]}{z}{at[2]}{e}"
+
+        return plain
 
     def _names(self, part: Features, places: Sequence[int], taken: set[str]) -> dict[str, str]:
         """What each node is called in the file, by id. Names repeat where they did so in their source."""
@@ -599,20 +630,28 @@ class _Writer:
         taken.update(wanted)
         return {part.ids[k]: name for k, name in zip(places, wanted, strict=True)}
 
-    def _edges(self, part: Features, kinds: Sequence[Any], names: Mapping[str, str]) -> dict[str, Lines]:
-        """The edges by the id of the node that they start at."""
-        edges: dict[str, Lines] = {}
-        corners = shapely.get_num_coordinates(part.geometry).tolist()
-        for i, p, kind, corner in zip(part.ids, part.properties, kinds, corners, strict=True):
-            if kind == "node":
-                self.dropped["nodes without a point"] += i not in names
-                continue
+    def _edges(self, part: Features, kinds: Sequence[Any], said: Mapping[str, str]) -> dict[str, Lines]:
+        """The edges by the id of the node that they start at. said: each node's name as YAML, by id."""
+        edges: dict[str, Lines] = {i: [] for i in said}
+        a, b, c = self._edge_template({}, None, None, fill=True)
+        plain = lost = 0
+        for i, p, kind in zip(part.ids, part.properties, kinds, strict=True):
             source, target = p.get("source"), p.get("target")
-            if kind != "edge" or not isinstance(source, str) or source not in names or not isinstance(target, str):
-                self.dropped["items that are neither a node nor an edge from a node"] += 1
+            if not (kind == "edge" and isinstance(source, str) and isinstance(target, str) and source in said):
+                lost += kind != "node"
                 continue
-            edges.setdefault(source, []).append((len(i), i, self._edge(p, i, names.get(target, target))))
-            self.dropped["edges' bends between their nodes"] += corner > 2
+            to = said.get(target) or _yaml.text(target)
+            if self._is_plain(p, self.plain_edge) and "action" not in p:
+                plain += 1
+                text = f"{a} {_yaml.text(i)}\n{b} {to}\n{c}"
+            else:
+                text = self._edge(p, i, to)
+            edges[source].append((len(i), i, text))
+        self.filled["edges"] += plain
+        self.dropped["items that are neither a node nor an edge from a node"] += lost
+        self.dropped["nodes without a point"] += kinds.count("node") - len(said)
+        bent = (shapely.get_num_coordinates(part.geometry) > 2) & [kind == "edge" for kind in kinds]
+        self.dropped["edges' bends between their nodes"] += int(bent.sum())
         return edges
 
     def _positions(self, part: Features, places: Sequence[int], elevation: float) -> list[tuple[str, str, str]]:
@@ -633,20 +672,21 @@ class _Writer:
         return self.turn is not None and isinstance(node, dict) and node.get("parent_frame") == self.turn.child
 
     def _edge(self, p: Properties, i: str, target: str) -> str:
-        own = p.get(NAME)
+        """The text of an edge. target: its target's name as YAML."""
+        own, action = p.get(NAME), p.get("action")
         rest: dict[str, Any] = own if isinstance(own, dict) else {}
         if "edge_id" in rest:
             i = str(rest["edge_id"])
             rest = {key: value for key, value in rest.items() if key != "edge_id"}
-        action = p.get("action")
-        more = None if p.keys() <= CANONICAL_EDGE else _more(p, CANONICAL_EDGE)
+        more = None if p.keys() <= self.plain_edge else self._more(p, CANONICAL_EDGE)
         fill = own is None or self.legacy
         self.filled["edges"] += fill
-        key = orjson.dumps((0, action, rest, more, fill))
+        # Edges alike but for their id and target share their text.
+        key = orjson.dumps((action, rest, more, fill)) if rest or more or action else fill
         pieces = self.templates.get(key)
         if pieces is None:
             pieces = self.templates[key] = self._edge_template(rest, action, more, fill=fill)
-        return f"{pieces[0]} {_yaml.text(i)}\n{pieces[1]} {_yaml.text(target)}\n{pieces[2]}"
+        return f"{pieces[0]} {_yaml.text(i)}\n{pieces[1]} {target}\n{pieces[2]}"
 
     def _edge_template(
         self, rest: Mapping[str, Any], action: Any, more: dict[str, Any] | None, *, fill: bool
@@ -664,13 +704,14 @@ class _Writer:
         pieces[0] = f"    - {pieces[0][6:]}"
         return pieces
 
-    def _node(self, p: Properties, name: str, at: tuple[str, str, str], edges: Lines) -> str:
+    def _node(self, p: Properties, name: str, said: str, at: tuple[str, str, str], edges: Lines) -> str:
+        """The text of a node's entry. said: its name as YAML. at: its position as texts."""
         own = p.get(NAME)
         rest: dict[str, Any] = own if isinstance(own, dict) else {}
         node = _mapping_of(rest.get("node"))
         more = None
-        if not p.keys() <= CANONICAL_NODE or p.get("name", name) != name:
-            more = _more(p, CANONICAL_NODE)
+        if not p.keys() <= self.plain_node or p.get("name", name) != name:
+            more = self._more(p, CANONICAL_NODE)
             if isinstance(p.get("name"), str) and p["name"] not in ("", name):
                 more["name"] = p["name"]
         if "name" in node or "edges" in node:
@@ -682,18 +723,16 @@ class _Writer:
         self.filled["orientations"] += quaternion is None
         fill = own is None or self.legacy
         self.filled["nodes"] += fill
-        key = orjson.dumps((1, quaternion is None, rest, more, fill))
+        key = ("node", quaternion is None, fill, orjson.dumps((rest, more)) if rest or more else None)
         pieces = self.templates.get(key)
         if pieces is None:
             pieces = self.templates[key] = self._node_template(
                 rest, node, more, known=quaternion is not None, fill=fill
             )
-        listed = "\n" + "".join(text for _, _, text in sorted(edges)) if edges else " []\n"
-        said = _yaml.text(name)
         meta = rest.get("meta")
         called = _yaml.text(str(meta["node"])) if isinstance(meta, dict) and "node" in meta else said
         pose = self._pose(node.get("pose"), at, quaternion or [0.0, 0.0, 0.0, 1.0], turned=self._turned(p))
-        return f"{pieces[0]} {called}\n{pieces[1]}{listed}{pieces[2]} {said}\n{pieces[3]}{pose}{pieces[4]}"
+        return f"{pieces[0]} {called}\n{pieces[1]}{_listed(edges)}{pieces[2]} {said}\n{pieces[3]}{pose}{pieces[4]}"
 
     def _pose(self, extra: Any, at: tuple[str, str, str], quaternion: list[float], *, turned: bool) -> str:
         """What stands behind ``pose:``."""
@@ -733,6 +772,10 @@ class _Writer:
         opening = f"{before}\n{head}"
         return [f"- {opening[2:]}", f"{middle}{between}\n{pieces[0]}", pieces[1], pieces[2], pieces[3] + after]
 
+    def _more(self, p: Properties, canonical: frozenset[str]) -> dict[str, Any]:
+        """Canonical words and other formats' knowledge, for an item's own ``properties``."""
+        return {key: value for key, value in p.items() if key not in canonical and key not in self.unwritten}
+
     def _report(self) -> None:
         fill, filled = self.context.fill, self.filled
         if filled["edges"]:
@@ -747,11 +790,14 @@ class _Writer:
             fill("nodes: pose.orientation", [0.0, 0.0, 0.0, 1.0], f"{filled['orientations']} nodes have none")
         for what, count in sorted(self.dropped.items()):
             self.context.drop(what, count, "tmap2 has no place for it")
+        for family in sorted(BULKY & self.unwritten):
+            items = [p for part in self.layers.vector("topology").values() for p in part.properties if family in p]
+            self.context.drop(f"{family} tags and attributes", len(items), f"left out for size; ask with {family}=true")
 
 
-def _more(p: Properties, canonical: frozenset[str]) -> dict[str, Any]:
-    """Canonical words and other formats' knowledge, for an item's own ``properties``."""
-    return {key: value for key, value in p.items() if key not in canonical and key not in UNWRITTEN}
+def _listed(items: Lines) -> str:
+    """What stands behind ``edges:`` or ``nodes:``."""
+    return "\n" + "".join([text for _, _, text in sorted(items)]) if items else " []\n"
 
 
 def _mapping_of(value: Any) -> dict[str, Any]:
