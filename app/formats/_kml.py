@@ -658,7 +658,9 @@ class _Reader:
         for k, item in enumerate(items):
             element = item.element
             title = titles[k]
-            own: dict[str, Any] = {"kind": "overlay" if local_name(element) in OVERLAYS else _KINDS[types[k]]}
+            own: dict[str, Any] = {
+                "kind": "overlay" if local_name(element) in OVERLAYS else _KINDS[types[k]] or _mixed(geometry[k])
+            }
             kept: dict[str, Any] = {"document": name, "place": k}
             if title is not None:
                 tag, text = title
@@ -756,7 +758,13 @@ class _Reader:
         return out
 
 
-_KINDS = ("poi", "path", "path", "region", "poi", "path", "region", "region")
+_KINDS = ("poi", "path", "path", "region", "poi", "path", "region", "")
+"""Kind of an object by its geometry's type number; a collection is judged by what is in it."""
+
+
+def _mixed(geometry: Any) -> str:
+    widest = shapely.get_dimensions(geometry)
+    return "note" if geometry.is_empty else ("poi", "path", "region")[widest]
 
 
 def _both(a: Features, b: Features) -> Features:

@@ -1,0 +1,198 @@
+"""KMZ: the main document is the first .kml entry, everything else comes back byte for byte, grids travel whole."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import shutil
+import subprocess
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.errors import BadUpload, TooLarge, UnreadableFile
+from app.formats import Group, Limits, ReadContext, WriteContext, _archive, get_format, read, write
+from app.model.features import Features
+from app.model.frame import GROUND, Datum
+from app.model.grid import OccupancyGrid
+from app.model.layers import MAP, Layers, PartKey, Resources
+
+SAMPLES = Path(__file__).parents[1] / "samples" / "kmz"
+OBJECTS = PartKey("objects", GROUND, "kml")
+RESOURCES = PartKey("resources", GROUND, "kmz")
+DATUM = Datum(50.0, 7.0, 60.0, 33.0)
+DOCUMENT = b'<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><name>A</name></Placemark></kml>'
+DRAWING = (
+    b'<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>Yard</name>'
+    b"<Point><coordinates>7.001,50.001</coordinates></Point></Placemark></Document></kml>"
+)
+
+
+def load(data: bytes, name: str = "a.kmz", **context: Any) -> Layers:
+    return read(Group(get_format("kmz"), name, {name: data}), ReadContext(**context))
+
+
+def save(layers: Layers) -> bytes:
+    return write(get_format("kmz"), layers, WriteContext())["map.kmz"]
+
+
+@pytest.fixture(scope="session")
+def real(shared: Path, facts_json: dict[str, Any]) -> dict[str, bytes]:
+    found = {name: (shared / "data" / name).read_bytes() for name in facts_json if name.endswith(".kmz")}
+    assert len(found) >= 10
+    return found
+
+
+REFUSED = {
+    "kmz/libkml/bad-too-large.kmz": TooLarge,
+    "kmz/libkml/overflow_bad_offset.kmz": UnreadableFile,
+    "kmz/libkml/nokml.kmz": UnreadableFile,
+}
+
+
+def test_every_real_archive_comes_back_whole(real, same, facts_json):
+    for name, data in real.items():
+        if name in REFUSED:
+            continue
+        layers = load(data)
+        once = save(layers)
+        assert same("kmz", {"a.kmz": data}, {"b.kmz": once}) == [], name
+        assert save(load(once)) == once, name
+        known = facts_json[name]["facts"]
+        with zipfile.ZipFile(io.BytesIO(once)) as archive:
+            assert archive.namelist()[0] == known["first_kml_entry"]
+        part = layers.parts[OBJECTS]
+        assert isinstance(part, Features)
+        drawn = [p for p in part.properties if p["kml"]["xml"].startswith("<Placemark")]
+        assert len(drawn) == known["first_kml"]["placemarks"], name
+
+
+def test_hostile_and_damaged_archives_are_refused(real):
+    for name, error in REFUSED.items():
+        with pytest.raises(error) as caught:
+            load(real[name])
+        assert caught.value.problems
+
+
+def test_our_sample(same):
+    data = (SAMPLES / "yard.kmz").read_bytes()
+    layers = load(data)
+    assert sorted(layers.resources()) == ["images/plan.png", "site/more.kml"]
+    part = layers.parts[OBJECTS]
+    assert isinstance(part, Features)
+    assert [p["kind"] for p in part.properties] == ["overlay", "note", "poi"]
+    once = save(layers)
+    assert same("kmz", {"a.kmz": data}, {"b.kmz": once}) == []
+    again = _archive.unpack(once, Limits())
+    before = _archive.unpack(data, Limits())
+    assert next(iter(again)) == "site/yard.kml"
+    assert {n: b for n, b in again.items() if n != "site/yard.kml"} == {
+        n: b for n, b in before.items() if n != "site/yard.kml"
+    }
+
+
+def test_the_drawing_of_an_archive_can_be_had_as_kml(same):
+    layers = load((SAMPLES / "yard.kmz").read_bytes())
+    context = WriteContext()
+    out = write(get_format("kml"), layers, context)
+    original = _archive.unpack((SAMPLES / "yard.kmz").read_bytes(), Limits())["site/yard.kml"]
+    assert same("kml", {"a.kml": original}, out) == []
+    assert context.dropped == [
+        {"what": "resources", "count": 2, "why": "images and further files of a drawing travel in KMZ only"}
+    ]
+
+
+def grids() -> Layers:
+    cells = np.random.default_rng(3).choice(np.array([0, 1, 37, 50, 99, 100, 255], np.uint8), (30, 41))
+    grid = OccupancyGrid(cells, 0.25, (-10.0, 5.0, math.radians(25.0)), "scale", 0.7, 0.2, True, {"x": {"y": [1]}})
+    flat = OccupancyGrid(np.full((3, 2), 255, np.uint8), 1.0)
+    parts = {PartKey("occupancy", GROUND, MAP): grid, PartKey("occupancy", "upper", "keep out"): flat}
+    return Layers(parts, DATUM)
+
+
+def test_grids_travel_whole():
+    layers = grids()
+    data = save(layers)
+    assert sorted(_archive.unpack(data, Limits())) == ["doc.kml", "map.png", "upper-keep_out.png"]
+    again = load(data)
+    assert again.datum == DATUM
+    assert set(again.parts) == set(layers.parts)
+    for key, grid in layers.grids().items():
+        other = again.grids()[key]
+        assert np.array_equal(grid.cells, other.cells)
+        names = ("resolution", "origin", "mode", "occupied_thresh", "free_thresh", "negate", "properties")
+        assert [getattr(grid, n) for n in names] == [getattr(other, n) for n in names]
+    assert save(again) == data
+
+
+def test_a_grid_beside_a_picture_of_the_same_name():
+    picture = Resources({"map.png": b"somebody's", "doc.kml.txt": b"x"})
+    layers = Layers({**grids().parts, RESOURCES: picture}, DATUM)
+    again = load(save(layers))
+    assert again.resources() == dict(picture.files)
+    assert len(again.grids()) == 2
+
+
+def test_a_grid_whose_picture_was_repainted_is_refused():
+    files = _archive.unpack(save(grids()), Limits())
+    from app.formats import _image
+
+    files["map.png"] = _image.encode_png(np.zeros((30, 41, 3), np.uint8))
+    with pytest.raises(UnreadableFile, match="colours"):
+        load(_archive.pack(files, "doc.kml"))
+
+
+def test_the_first_kml_in_the_archive_is_the_main_document():
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr("b.txt", b"1")
+        archive.writestr("z/Main.KML", DOCUMENT)
+        archive.writestr("doc.kml", DOCUMENT.replace(b">A<", b">B<"))
+    layers = load(out.getvalue())
+    part = layers.parts[OBJECTS]
+    assert isinstance(part, Features)
+    assert part.ids == ("A",)
+    assert sorted(layers.resources()) == ["b.txt", "doc.kml"]
+    assert next(iter(_archive.unpack(save(layers), Limits()))) == "z/Main.KML"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"<kml/>", _archive.pack({}), _archive.pack({"a.txt": b"1"}), _archive.pack({"doc.kml": b"<kml>"})],
+    ids=["empty", "no archive", "nothing in it", "no kml", "broken kml"],
+)
+def test_bad_archives_are_refused(data):
+    with pytest.raises(BadUpload) as caught:
+        load(data)
+    assert caught.value.problems
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "answer"),
+    [
+        ("a.kmz", b"damaged", True),
+        ("upload", _archive.pack({"doc.kml": DOCUMENT}), True),
+        ("folder.zip", _archive.pack({"doc.kml": DOCUMENT}), False),
+        ("folder", _archive.pack({"map.yaml": b""}), False),
+        ("a.kml", DOCUMENT, False),
+    ],
+)
+def test_detection(name, data, answer):
+    assert get_format("kmz").detect(name, data) is answer
+
+
+def test_another_reader_reads_what_we_write(tmp_path):
+    tool = shutil.which("ogrinfo")
+    if tool is None:
+        if os.environ.get("CI"):
+            pytest.fail("ogrinfo is absent")
+        pytest.skip("ogrinfo is absent")
+    path = tmp_path / "map.kmz"
+    path.write_bytes(save(Layers({**load(_archive.pack({"doc.kml": DRAWING})).parts, **grids().parts}, DATUM)))
+    done = subprocess.run([tool, "-ro", "-al", str(path)], capture_output=True, text=True, check=True)
+    assert "ERROR" not in done.stdout + done.stderr
+    assert "Yard" in done.stdout
