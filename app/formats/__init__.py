@@ -133,10 +133,11 @@ class Format:
     name: the contract's id. files: the names it is served as. media_types: of the served files, in that order.
     carries: layers it can hold. needs: what writing takes. detect: is this file (name, content) the main file of such
     a map; sure formats first (``rank``). companions: further files of the upload that belong to a main file.
-    family: format family of its objects (``osm``, ``kml`` …). drawing: its lines and polygons may be meant for any layer
-    (the upload's ``layer`` says which). rank: of two files that tell the same network, the higher one wins. version:
+    family: format family of its objects (``osm``, ``kml`` …). drawing: its lines and polygons may be meant for any
+    layer (the upload's ``layer`` says which). rank: of two files that tell the same network, the higher one wins. version:
     raise it when the same layers give other bytes (it is part of every ETag). choose: of the parts that it carries,
-    those that these options ask for. outlines: it writes where grids lie, not their cells.
+    those that these options ask for. by_file: the options that a wanted file's name says. outlines: it writes where
+    grids lie, not their cells.
     """
 
     name: str
@@ -157,6 +158,7 @@ class Format:
     version: int = 1
     extensions: tuple[str, ...] = ()
     choose: Callable[[Sequence[PartKey], Any], Sequence[PartKey]] = lambda keys, options: keys
+    by_file: Callable[[str], Mapping[str, str]] = lambda name: {}
     outlines: bool = False
 
 

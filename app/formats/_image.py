@@ -168,6 +168,23 @@ def overlay_png(grid: OccupancyGrid) -> bytes:
     return encode_png(grid.cells, flip=True, palette=palette)
 
 
+def size_of(data: bytes, limits: Limits) -> tuple[int, int]:
+    """(width, height) by the header alone. Raises UnreadableFile or TooLarge."""
+    kind = kind_of(data)
+    if kind == "pgm" and data[:2] in (b"P2", b"P5"):
+        grey = _read_pgm(data, limits)
+        return grey.width, grey.height
+    names = {"png": "PNG", "jpeg": "JPEG", "bmp": "BMP", "pgm": "PPM"}
+    if kind is None:
+        raise UnreadableFile("its first bytes are not those of a PGM, PNG, BMP or JPEG picture")
+    try:
+        with Image.open(io.BytesIO(data), formats=[names[kind]]) as image:
+            _check_size(image.width, image.height, limits)
+            return image.width, image.height
+    except (OSError, SyntaxError, ValueError, LookupError, TypeError, EOFError, struct.error, zlib.error) as error:
+        raise UnreadableFile(f"the {names[kind]} picture is damaged: {error}") from error
+
+
 def look_up(pixels: Bytes, table: bytes) -> Bytes:
     """table[pixels]: bytes.translate takes a third of the time of numpy's indexing. The result is read-only."""
     return np.frombuffer(pixels.tobytes().translate(table), np.uint8).reshape(pixels.shape)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from app.errors import Ambiguous, BadUpload, FleetMapError, Invalid, MissingLayer, NotFound, Problem, UnreadableFile
 from app.formats import BAD_INPUT, Files, Format, Limits, Needs, ReadContext, WriteContext, _image, _yaml, register
 from app.model.frame import GROUND, MAX_METRES
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, Mode, OccupancyGrid
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, Mode, OccupancyGrid, outline
 from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
 
@@ -252,9 +252,13 @@ def _layers(
         reason = f"the origin is turned by {yaw:g} rad; Nav2 ignores that: ask for the map with normalize=true"
         context.warn(reason, file=main, line=line, where="origin")
     try:
-        shades = _image.read_grey(files[picture], context.limits)
-        rule = _rule(said["mode"], said["negate"], said["occupied_thresh"], said["free_thresh"])
-        cells = _cells(shades, rule, said["mode"])
+        if context.cells:
+            shades = _image.read_grey(files[picture], context.limits)
+            rule = _rule(said["mode"], said["negate"], said["occupied_thresh"], said["free_thresh"])
+            cells = _cells(shades, rule, said["mode"])
+        else:
+            width, height = _image.size_of(files[picture], context.limits)
+            cells = outline(height, width)
     except BadUpload as error:
         raise type(error)(f"{picture}: {error.detail}", [Problem(error.detail, picture)]) from error
     grid = OccupancyGrid(
@@ -325,7 +329,8 @@ def _line(data: bytes, key: str) -> int | None:
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """``<grid>.yaml`` and its picture. Raises MissingLayer, NotFound, Ambiguous, or Invalid for impossible options."""
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
-    key, grid = _choose(layers, options)
+    key = choose(sorted(layers.grids()), options)[0]
+    grid = layers.grids()[key]
     if options.resolution is not None and options.resolution != grid.resolution:
         grid = resampled(grid, options.resolution)
     if options.normalize:
@@ -342,12 +347,12 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     return {stem + ".yaml": _yaml_text(grid, picture), picture: _picture(grid, pixels, kind)}
 
 
-def _choose(layers: Layers, options: WriteOptions) -> tuple[PartKey, OccupancyGrid]:
+def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named grid; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
-    every = layers.grids()
+    every = [key for key in keys if key.layer == "occupancy"]
     if not every:
         raise MissingLayer("there is no occupancy grid: upload one (a YAML and its image)")
-    found = {key: grid for key, grid in every.items() if options.level in (None, key.level)}
+    found = [key for key in every if options.level in (None, key.level)]
     names = sorted({key.name for key in found})
     if not found:
         levels = ", ".join(sorted({key.level for key in every}))
@@ -355,16 +360,24 @@ def _choose(layers: Layers, options: WriteOptions) -> tuple[PartKey, OccupancyGr
     name = options.grid or (MAP if MAP in names else names[0] if len(names) == 1 else None)
     if name is None:
         raise Ambiguous(f"there are several grids, name one with grid=…: {', '.join(names)}")
-    found = {key: grid for key, grid in found.items() if key.name == name}
+    found = [key for key in found if key.name == name]
     if not found:
         raise NotFound(f"there is no grid {name!r}; there are: {', '.join(names)}")
     if len(found) > 1:
-        ground = {key: grid for key, grid in found.items() if key.level == GROUND}
+        ground = [key for key in found if key.level == GROUND]
         if not ground:
             levels = ", ".join(key.level for key in found)
             raise Ambiguous(f"the grid {name!r} is there on several levels, name one with level=…: {levels}")
         found = ground
-    return next(iter(found.items()))
+    return found
+
+
+def by_file(name: str) -> dict[str, str]:
+    """``keepout.yaml`` and ``keepout.pgm`` are the grid ``keepout``; ``keepout.png`` asks for a PNG, too."""
+    stem, _, end = name.rpartition(".")
+    if not stem or f".{end}" not in (*YAML_ENDS, ".pgm", ".png"):
+        return {}
+    return {"grid": stem, **({"file_type": end} if end in ("pgm", "png") else {})}
 
 
 def _encoding(
@@ -616,6 +629,8 @@ register(
         companions=companions,
         read_options=ReadOptions,
         write_options=WriteOptions,
+        choose=choose,
+        by_file=by_file,
         rank=40,
         extensions=(*YAML_ENDS, *IMAGE_ENDS),
     )

@@ -21,6 +21,11 @@ UNKNOWN = 255
 """Cell values: 0…100 is Nav2's cell value, 255 its -1."""
 
 
+def outline(height: int, width: int) -> NDArray[np.uint8]:
+    """Unknown cells that take no memory: for a grid of which only the place matters."""
+    return np.broadcast_to(np.uint8(UNKNOWN), (height, width))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class OccupancyGrid:
     """Cells and where they lie.
@@ -57,7 +62,7 @@ class OccupancyGrid:
         object.__setattr__(self, "origin", tuple(float(v) + 0.0 for v in self.origin))
         if self.mode not in ("trinary", "scale", "raw"):
             raise Invalid(f"mode must be trinary, scale or raw, got {self.mode!r}")
-        if _beyond(self.cells):
+        if any(self.cells.strides) and _beyond(self.cells):  # no strides: one value all over, see outline()
             raise Invalid("cells must be 0 to 100, or 255 for unknown")
         self.cells.flags.writeable = False
 
