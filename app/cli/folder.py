@@ -18,17 +18,10 @@ from app.cli.client import LocalFile
 from app.errors import Invalid
 
 CONFIG = "config"
-PARTS = ("location", "metric", "topological", "world")
-"""The folders of an environment_template's config."""
-
 SCRIPTS = ("environment.sh", "properties.sh")
 """Read as literal assignments by the server; never run."""
 
 SKIPPED = frozenset({".git", ".svn", ".hg", "__pycache__", "node_modules", ".DS_Store"})
-
-RESERVED = frozenset({"robots", "server"})
-
-NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +56,13 @@ def environment_name(text: str) -> str:
 
     Invalid where nothing is left or the name is reserved.
     """
+    from app.store.base import check_environment_name
+
     name = re.sub(r"[^a-z0-9_-]+", "-", text.lower()).strip("-_")[:63].rstrip("-_")
-    if not NAME.fullmatch(name) or name in RESERVED:
-        raise Invalid(f"{text!r} makes no name for an environment: give one with --environment")
-    return name
+    try:
+        return check_environment_name(name)
+    except Invalid as error:
+        raise Invalid(f"{text!r} makes no name for an environment: give one with --environment") from error
 
 
 def single(path: Path, name: str | None = None) -> LocalFile:
@@ -84,7 +80,9 @@ def _template(folder: Path) -> tuple[Path, Path | None]:
 
 
 def _is_config(folder: Path) -> bool:
-    return folder.is_dir() and any((folder / part).is_dir() for part in PARTS)
+    from app.bundle import TEMPLATE_FOLDERS
+
+    return folder.is_dir() and any((folder / part).is_dir() for part in TEMPLATE_FOLDERS)
 
 
 def _walk(folder: Path, root: Path, notes: list[str]) -> Iterator[Path]:

@@ -154,22 +154,10 @@ def convert(
 
 def list_formats(as_json: options.Json = False) -> None:
     """All formats that are read and served, with their options. Needs no server."""
-    from app import formats, parameters
+    from app import formats
+    from app.api.formats import as_dict
 
-    known: list[dict[str, Any]] = [
-        {
-            "id": f.name,
-            "title": f.title,
-            "files": list(f.files),
-            "media_types": list(f.media_types),
-            "read": f.read is not None,
-            "write": f.write is not None,
-            "layers": [layer for layer in LAYERS if layer in f.carries],
-            "read_options": parameters.describe(f.read_options),
-            "write_options": parameters.describe(f.write_options),
-        }
-        for f in formats.all_formats().values()
-    ]
+    known = [as_dict(f) for f in formats.all_formats().values()]
     if as_json:
         output.show_json(known)
         return
@@ -179,8 +167,8 @@ def list_formats(as_json: options.Json = False) -> None:
             f["title"],
             "yes" if f["read"] else "-",
             ", ".join(f["files"]) if f["write"] else "-",
-            ", ".join(f["layers"]),
-            ", ".join(p["name"] for p in f["write_options"]) or "-",
+            ", ".join(layer for layer, how in f["information"].items() if how == "raw"),
+            ", ".join(p["name"] for p in f["options"] if p["for"] == "write") or "-",
         )
         for f in known
     ]

@@ -15,7 +15,6 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -33,9 +32,6 @@ SECRETS_DIR = "FLEETMAP_SECRETS_DIR"
 """Names the folder where a container mounts secrets: a file named like a setting (``fleetmap_admin_token``) holds its
 value. It is no setting itself, since it says where settings are."""
 
-STOP_SECONDS = 20
-"""How long requests that are being answered may take after SIGTERM."""
-
 START_SECONDS = 60.0
 """How long the demo waits for the server to be ready."""
 
@@ -46,14 +42,6 @@ DEMO_TOKEN = "demo-token"  # noqa: S105  the name of a file
 """In the data folder, readable for its owner: lets ``serve --demo`` print commands that work at every start."""
 
 
-@dataclass(frozen=True, slots=True)
-class Access:
-    """The administrator's token, where it is known, and whether it was made just now."""
-
-    text: str | None
-    made: bool = False
-
-
 def serve(*, demo: bool = False, **values: Any) -> None:
     """Start the server in the foreground; it stops cleanly on SIGTERM and Ctrl-C.
 
@@ -61,18 +49,19 @@ def serve(*, demo: bool = False, **values: Any) -> None:
     that FLEETMAP_SECRETS_DIR names.
     """
     settings = load_settings(values)
+    if demo:
+        settings = with_demo_token(settings)
     listener = listen(settings.host, settings.port)
     try:
         address = address_of(listener)
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
-        access = prepare(settings, demo=demo)
+        check(settings)
         os.environ.update(settings.as_environment())  # what worker processes read
         output.show(f"Fleet Map Server: {address} · documentation: {address}/docs")
-        if access.made:
-            output.show(f"administrator's token, shown only this once: {access.text}")
         sys.stdout.flush()
         if demo:
-            threading.Thread(target=_bring_demo, args=(address, access.text), daemon=True).start()
+            token = settings.admin_token.get_secret_value() if settings.admin_token else None
+            threading.Thread(target=_bring_demo, args=(address, token), daemon=True).start()
         _run(settings, listener)
     finally:
         listener.close()
@@ -118,7 +107,7 @@ def application() -> Any:
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    return importlib.import_module("app.main").create_app(load_settings({}))
+    return _main().create_app(load_settings({}))
 
 
 def load_settings(values: Mapping[str, Any]) -> Settings:
@@ -197,28 +186,32 @@ def address_of(listener: socket.socket) -> str:
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
-def prepare(settings: Settings, *, demo: bool = False) -> Access:
-    """Make the store ready before the first request: schema (SQLite), leftovers of a crash, the first token."""
+def check(settings: Settings) -> None:
+    """Whether the server could start, told before it does; Unavailable with what to do about it."""
     with _store(settings) as store:
         if settings.database.startswith("sqlite"):
             store.migrate()
-        store.check()
-        if settings.insecure_no_auth:
-            return Access(None)
-        access = Access(None)
-        kept = settings.data_dir / DEMO_TOKEN
-        if settings.admin_token is not None:
-            access = Access(settings.admin_token.get_secret_value())
-        elif demo and kept.is_file():
-            access = Access(kept.read_text().strip())
-        elif demo or not any(token.role == "admin" for token in store.tokens()):
-            access = Access(secrets.token_urlsafe(32), made=True)
-        if access.text is not None and store.find_token(access.text) is None:
-            store.create_token("demo" if demo else "administrator", "admin", token=access.text)
-    if demo and access.made and access.text is not None:
-        with open(os.open(kept, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as stream:  # noqa: PTH123  with its mode
-            stream.write(access.text + "\n")
-    return access
+        try:
+            store.check()
+        except Unavailable as error:
+            raise Unavailable(f"{error.detail} (`fleetmap migrate` makes a database's schema current)") from error
+
+
+def with_demo_token(settings: Settings) -> Settings:
+    """The settings with an administrator's token that stays the same at every start of the demo.
+
+    It is kept in the data folder, readable for its owner alone. One that the operator has set is left as it is.
+    """
+    from pydantic import SecretStr
+
+    if settings.admin_token is not None or settings.insecure_no_auth:
+        return settings
+    settings.data_dir.mkdir(parents=True, exist_ok=True)
+    kept = settings.data_dir / DEMO_TOKEN
+    if not kept.is_file() or not kept.read_text().strip():
+        with open(os.open(kept, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as stream:  # noqa: PTH123  its mode
+            stream.write(secrets.token_urlsafe(32) + "\n")
+    return settings.model_copy(update={"admin_token": SecretStr(kept.read_text().strip())})
 
 
 def _store(settings: Settings) -> Any:
@@ -240,21 +233,16 @@ def _without_password(url: str) -> str:
     return make_url(url).render_as_string(hide_password=True)
 
 
+def _main() -> Any:
+    """``app.main``, by name: a command is no part of the application that it starts."""
+    return importlib.import_module("app.main")
+
+
 def _run(settings: Settings, listener: socket.socket) -> None:
     import uvicorn
     from uvicorn.supervisors import Multiprocess
 
-    config = uvicorn.Config(
-        "app.cli.serving:application",
-        factory=True,
-        host=settings.host,
-        port=settings.port,
-        workers=settings.workers,
-        log_level=settings.log_level,
-        access_log=settings.log_level == "debug",
-        server_header=False,
-        timeout_graceful_shutdown=STOP_SECONDS,
-    )
+    config = _main().server_config(settings, "app.cli.serving:application")
     # Uvicorn raises the signal again once it has shut down; after a clean stop the exit status shall be 0.
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(signal_number, lambda *_: None)

@@ -133,7 +133,7 @@ def test_coverage_and_formats(fleetmap: Fleetmap, network: Path) -> None:
     assert "tmap2" in told
     known = {f["id"]: f for f in fleetmap("formats", "--json").json}
     assert {"datum", "geojson", "kml", "kmz", "occupancy_grid", "osm", "tmap2"} <= set(known)
-    assert "resolution" in {o["name"] for o in known["occupancy_grid"]["write_options"]}
+    assert "resolution" in {o["name"] for o in known["occupancy_grid"]["options"]}
 
 
 def test_tokens(fleetmap: Fleetmap, network: Path) -> None:
