@@ -196,7 +196,7 @@ def _scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
     _well_formed(data)
     count = {p: int(codes[_pair(p)]) for p in (b"no", b"/n", b"wa", b"re", b"nd", b"ta", b"me", b"bo")}
     rows = _NODE.findall(data)
-    bounds = _BOUNDS.findall(data, root.end())
+    bounds = _BOUNDS.findall(data, root.end()) if count[b"bo"] else []
     if len(rows) != count[b"no"] or len(bounds) != count[b"bo"]:
         return None
     children = _Children()
@@ -229,7 +229,7 @@ def _scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
         text = row[1] + row[4]
         known = cache.get(text)
         if known is None:
-            known = cache[text] = _attributes(text)
+            known = cache[text] = children.attributes(text)
         return known
 
     ids = [int(row[0]) for row in rows]
@@ -266,6 +266,14 @@ def _well_formed(data: bytes) -> None:
         raise UnreadableFile(f"not well-formed XML: {reason}", [Problem(reason, line=error.lineno)]) from error
 
 
+class _Texts(dict[bytes, str]):
+    """Raw attribute values -> text, each worked out once: keys and values of tags repeat a lot."""
+
+    def __missing__(self, raw: bytes) -> str:
+        text = self[raw] = unescape(raw)
+        return text
+
+
 class _Children:
     """Reads the elements inside nodes, ways and relations, counting them; ``regular`` falls at the first odd one."""
 
@@ -274,7 +282,12 @@ class _Children:
     def __init__(self) -> None:
         self.nds = self.members = self.tagged = 0
         self.regular = True
-        self.texts: dict[bytes, str] = {}
+        self.texts = _Texts()
+
+    def attributes(self, text: bytes) -> Attributes:
+        """The attributes in this part of a tag."""
+        texts = self.texts
+        return {texts[k]: texts[v] for k, v in _ATTRIBUTE.findall(text)}
 
     def tags(self, body: bytes, others: int) -> Tags:
         """The tags in an element's body that has ``others`` further elements."""
@@ -282,12 +295,8 @@ class _Children:
         self.tagged += len(found)
         if body.count(b"<") != len(found) + others:
             self.regular = False
-        texts, out = self.texts, {}
-        for k, v in found:
-            key = texts.get(k)
-            if key is None:
-                key = texts[k] = unescape(k)
-            out[key] = unescape(v)
+        texts = self.texts
+        out = {texts[k]: texts[v] for k, v in found}
         if len(out) != len(found):
             # A key twice: the careful way tells of it.
             self.regular = False
@@ -304,7 +313,9 @@ def _scan_ways(data: bytes, children: _Children, highways_only: bool) -> list[Wa
         refs = [int(r) for r in _ND.findall(part, end)]
         children.nds += len(refs)
         tags = children.tags(part[end:], len(refs))
-        out.append(Way(int(head[1]), refs, tags, _attributes(head[2])))
+        # For the network alone it matters only whether the way is still there.
+        needed = not highways_only or b'action="delete"' in head[2] or b'visible="false"' in head[2]
+        out.append(Way(int(head[1]), refs, tags, children.attributes(head[2]) if needed else {}))
     return out
 
 
@@ -318,7 +329,7 @@ def _scan_relations(data: bytes, children: _Children) -> list[Relation] | None:
         members = [(t.decode(), int(r), unescape(role)) for t, r, role in _MEMBER.findall(part, end)]
         children.members += len(members)
         tags = children.tags(part[end:], len(members))
-        out.append(Relation(int(head[1]), members, tags, _attributes(head[2])))
+        out.append(Relation(int(head[1]), members, tags, children.attributes(head[2])))
     return out
 
 
@@ -326,12 +337,17 @@ def _parts(data: bytes, name: bytes, holding: bytes = b"") -> Iterator[bytes]:
     """What stands after each ``<name `` up to its end: its attributes and body; only those with ``holding`` in them."""
     close = b"</" + name + b">"
     for part in data.split(b"<" + name + b" ")[1:]:
-        if holding not in part:
-            continue
         tag = part.find(b">")
-        end = part.find(close, tag)
-        # Closed in its own tag, or by the closing tag that comes before the next one begins.
-        cut = part[: tag + 1] if end < 0 or part[tag - 1 : tag] == b"/" else part[:end]
+        if part[tag - 1 : tag] == b"/":
+            cut = part[: tag + 1]
+        elif close not in part:
+            # One inside another: nothing that this way can read.
+            yield b""
+            continue
+        elif holding not in part:
+            continue
+        else:
+            cut = part[: part.find(close, tag)]
         if holding in cut:
             yield cut
 

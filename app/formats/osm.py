@@ -187,10 +187,10 @@ def detect(name: str, data: bytes) -> bool:  # noqa: ARG001
         return True
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         head = head.decode("utf-16", "replace").encode()
-    first = re.search(rb"<([A-Za-z_][\w:.-]*)", re.sub(rb"(?s)<!--.*?-->", b"", head))
-    return bool(first) and first[1] == b"osm" if first else False
+    return bool(_FIRST.match(head.lstrip(b"\xef\xbb\xbf")))
 
 
+_FIRST = re.compile(rb"(?s)\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+(?:<osm[\s/>]|<!DOCTYPE\s+osm\b)")
 _GZIP = tuple(b"\x1f\x8b" + bytes([k]) for k in (8,))
 
 
@@ -1024,7 +1024,11 @@ def _texts(value: Any) -> Mapping[str, str]:
     """A mapping of texts to texts, whatever was stored."""
     if not isinstance(value, Mapping):
         return NOTHING
-    if all(type(v) is str for v in value.values()):
+    try:
+        "".join(value.values())
+    except TypeError:
+        pass
+    else:
         return value
     return {k: v if isinstance(v, str) else str(v) for k, v in value.items() if v is not None}
 

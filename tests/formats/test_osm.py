@@ -1,0 +1,649 @@
+"""OpenStreetMap in and out: facts counted by others, round trips, edits, oddities of real extracts, hostile bytes."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import os
+import random
+import shutil
+import subprocess
+import tracemalloc
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import networkx
+import numpy as np
+import pytest
+import shapely
+from lxml import etree
+
+from app import formats
+from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
+from app.formats import Group, Limits, ReadContext, WriteContext, _osm, osm
+from app.model.features import Features, features
+from app.model.frame import Datum, Level
+from app.model.geodesy import local_frame
+from app.model.layers import NETWORK, SITE, ZONES, Layers, PartKey
+
+SAMPLE = Path(__file__).parents[1] / "samples" / "osm" / "quarter.osm"
+REAL = ("urban-usa-mn-minnesota-zoo", "urban-usa-fl-miami-subberbs", "urban-netherlands-subburbs")
+TOPOLOGY, OBJECTS = PartKey("topology", "ground", NETWORK), PartKey("objects", "ground", "osm")
+
+
+def read(data: bytes, context: ReadContext | None = None, **options: Any) -> Layers:
+    known = formats.get_format("osm")
+    return formats.read(Group(known, "map.osm", {"map.osm": data}), context or ReadContext(**options))
+
+
+def write(layers: Layers, context: WriteContext | None = None) -> bytes:
+    (data,) = formats.write(formats.get_format("osm"), layers, context or WriteContext()).values()
+    return data
+
+
+def part(layers: Layers, key: PartKey) -> Features:
+    found = layers.parts[key]
+    assert isinstance(found, Features)
+    return found
+
+
+def network(layers: Layers) -> networkx.MultiDiGraph:
+    graph = networkx.MultiDiGraph()
+    for f in part(layers, TOPOLOGY):
+        if f.properties["kind"] == "node":
+            graph.add_node(f.id, at=f.geometry.coords[0])
+    for f in part(layers, TOPOLOGY):
+        if f.properties["kind"] == "edge":
+            assert f.properties["source"] in graph
+            assert f.properties["target"] in graph
+            graph.add_edge(f.properties["source"], f.properties["target"], key=f.id)
+    return graph
+
+
+def xml(body: str, root: str = '<osm version="0.6">') -> bytes:
+    return f"<?xml version='1.0' encoding='UTF-8'?>\n{root}\n{body}\n</osm>".encode()
+
+
+def elements(data: bytes) -> dict[str, Any]:
+    """type + id -> (attributes, refs or members, tags)."""
+    root = etree.fromstring(data)
+    out = {}
+    for e in root.iterchildren("node", "way", "relation"):
+        inner = [dict(c.attrib) for c in e if c.tag != "tag"]
+        out[e.tag[0] + e.get("id")] = (dict(e.attrib), inner, {t.get("k"): t.get("v") for t in e.iterchildren("tag")})
+    return out
+
+
+def refs(data: bytes, way: str) -> list[str]:
+    return [m["ref"] for m in elements(data)[way][1]]
+
+
+def check_with_osmium(data: bytes, folder: Path) -> None:
+    tool = shutil.which("osmium")
+    if tool is None:
+        if os.environ.get("CI"):
+            pytest.fail("osmium (osmium-tool) is absent")
+        pytest.skip("osmium (osmium-tool) is absent")
+    path = folder / "served.osm"
+    path.write_bytes(data)
+    subprocess.run([tool, "fileinfo", "-e", str(path)], check=True, capture_output=True)
+    subprocess.run([tool, "check-refs", str(path)], check=True, capture_output=True)
+
+
+# --- real extracts -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_extracts_agree_with_counted_facts(name: str, shared: Path, facts_json: dict[str, Any]) -> None:
+    path = f"osm/{name}/osm.xml"
+    known = facts_json[path]["facts"]
+    layers = read((shared / "data" / path).read_bytes())
+    graph = network(layers)
+    assert graph.number_of_nodes() == known["distinct_nodes_used_by_highway_ways"]
+    undirected = {frozenset((a, b)) for a, b, _ in graph.edges}
+    assert len(undirected) == known["undirected_highway_edges"]
+    assert networkx.number_weakly_connected_components(graph) == known["highway_connected_components"]
+    objects = part(layers, OBJECTS)
+    highways = objects.of_kind("highway")
+    ways = [p["osm"]["tags"]["highway"] for p, i in zip(highways.properties, highways.ids, strict=True) if i[0] == "w"]
+    assert {k: ways.count(k) for k in ways} == known["highway_kinds"]
+    assert sum(i[0] == "w" for i in objects.ids) == known["ways"]
+    assert sum(i[0] == "r" for i in objects.ids) == known["relations"]
+    box = known["bounds_element"]
+    assert objects.document["bounds"] == [box["minlon"], box["minlat"], box["maxlon"], box["maxlat"]]
+    assert "http://opendatacommons.org/licenses/odbl/1-0/" in objects.document["attribution"]
+    # A two-way street is two edges; a one-way street is one, in the direction of its tags.
+    directed = {(a, b) for a, b, _ in graph.edges}
+    two_way = sum((b, a) in directed for a, b in directed)
+    assert 0 < two_way < graph.number_of_edges()
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_committed_datums_are_the_corner_of_the_bounds(name: str, shared: Path, facts_json: dict[str, Any]) -> None:
+    known = facts_json[f"osm/{name}/datum_autogen.yaml"]["facts"]
+    west, south, _, _ = part(read((shared / "data/osm" / name / "osm.xml").read_bytes()), TOPOLOGY).document["bounds"]
+    assert [south, west] == [known["datum_latitude"], known["datum_longitude"]]
+
+
+def test_the_datasets_own_network_has_our_nodes_and_edges(shared: Path, facts: Any) -> None:
+    folder = shared / "data/osm/urban-usa-mn-minnesota-zoo"
+    theirs = facts.tmap2_nodes(facts.tmap2((folder / "network_autogen.tmap2.yaml").read_bytes()))
+    graph = network(read((folder / "osm.xml").read_bytes(), wanted=frozenset({"topology"})))
+    assert len(theirs) == graph.number_of_nodes()
+    # Their names are not ours; their degrees and places are: (0, 0) is the datum, metres by their own rule.
+    degrees = sorted(len({e["node"] for e in n["edges"]}) for n in theirs)
+    ours = networkx.Graph(graph.to_undirected())
+    assert sum(degrees) in range(2 * ours.number_of_edges() - 10, 2 * ours.number_of_edges() + 1)
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_extracts_come_back(name: str, shared: Path, same: Callable[..., list[str]], tmp_path: Path) -> None:
+    data = (shared / "data/osm" / name / "osm.xml").read_bytes()
+    layers = read(data)
+    context = WriteContext()
+    served = write(layers, context)
+    assert same("osm", {"osm.xml": data}, {"map.osm": served}) == []
+    assert context.dropped == []
+    before, after = elements(data), elements(served)
+    for key, (attributes, inner, tags) in before.items():
+        numbers = {k: float(attributes.pop(k)) for k in ("lat", "lon") if k in attributes}
+        assert numbers == {k: float(after[key][0].pop(k)) for k in numbers}
+        assert (attributes, inner, tags) == after[key], key
+    assert dict(etree.fromstring(data).attrib) == dict(etree.fromstring(served).attrib)
+    assert write(read(served)) == served
+    check_with_osmium(served, tmp_path)
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_both_ways_through_xml_and_a_reader_who_wants_less(name: str, shared: Path) -> None:
+    data = (shared / "data/osm" / name / "osm.xml").read_bytes()
+    quick, careful = _osm._scan(data, Limits(), False), _osm._events(data, Limits())
+    assert quick is not None, "a file as the OSM server writes it is regular"
+    assert quick.ids == careful.ids
+    assert np.array_equal(quick.lonlat, careful.lonlat)
+    assert (quick.tags, quick.ways, quick.relations) == (careful.tags, careful.ways, careful.relations)
+    assert (quick.root, quick.bounds) == (careful.root, careful.bounds)
+    assert all(quick.attributes(k) == careful.attributes(k) for k in range(len(quick.ids)))
+    whole, less = read(data), read(data, wanted=frozenset({"topology"}))
+    assert set(less.parts) == {TOPOLOGY}
+    a, b = part(whole, TOPOLOGY), part(less, TOPOLOGY)
+    assert (a.ids, a.properties, a.document) == (b.ids, b.properties, b.document)
+    assert shapely.equals(a.geometry, b.geometry).all()
+
+
+def test_defective_files_as_their_authors_mean_them(shared: Path, same: Callable[..., list[str]]) -> None:
+    folder = shared / "data/osm/osm-testdata-xml"
+    for case in sorted(folder.iterdir()):
+        data = (case / "data.osm").read_bytes()
+        result = (case / "result").read_text().strip() if (case / "result").exists() else ""
+        if result == "invalid":
+            with pytest.raises(UnreadableFile) as refused:
+                read(data)
+            assert refused.value.problems[0].problem, case.name
+            assert refused.value.problems[0].line, case.name
+        else:
+            assert same("osm", {"a.osm": data}, {"b.osm": write(read(data))}) == [], case.name
+
+
+def test_odd_files_come_back(shared: Path, same: Callable[..., list[str]], tmp_path: Path) -> None:
+    paths = [*sorted((shared / "data/osm/osm-testdata-grid").rglob("data.osm")), SAMPLE]
+    paths += sorted((shared / "data/lanelet2").rglob("*.osm"))
+    assert len(paths) > 10
+    for path in paths:
+        data = path.read_bytes()
+        served = write(read(data))
+        assert same("osm", {"a.osm": data}, {"b.osm": served}) == [], path.name
+    check_with_osmium(write(read((paths[0]).read_bytes())), tmp_path)
+
+
+# --- a small extract with every oddity ---------------------------------------------------------------------------
+
+
+def test_the_samples_network() -> None:
+    context = ReadContext()
+    layers = read(SAMPLE.read_bytes(), context)
+    graph = network(layers)
+    assert set(graph) == {"n1", "n2", "n3", "n4", "n5", "n9000000000"}
+    assert {k for _, _, k in graph.edges} == {
+        *("w100:1-2", "w100:2-1", "w100:2-3", "w100:3-2"),
+        *("w101:2-4", "w101:4-9000000000", "w102:5-4"),
+        *("w103:3-5", "w103:5-3", "w103:5-3#2", "w103:3-5#2"),
+    }
+    assert graph.nodes["n2"]["at"] == (7.001, 50.0)
+    said = {f.id: f.properties for f in part(layers, TOPOLOGY)}
+    assert said["n2"]["osm"]["tags"] == {"highway": "traffic_signals"}
+    assert said["n3"]["osm"]["attributes"]["user"] == 'Zoë & "Co"'
+    assert said["w100:1-2"]["osm"] == {"way": 100, "tags": {"highway": "residential", "name": "Straße"}}
+    texts = " ".join(f"{p.where} {p.problem}" for p in context.warnings)
+    for expected in ("way 103 the way goes from a node to itself", "way 106 the way is marked as deleted"):
+        assert expected in texts
+    assert "2 nodes that have no place" in texts
+    assert "node 7 the node has no place" in texts
+    assert "way 105 the way has no nodes" in texts
+
+
+def test_the_samples_objects() -> None:
+    objects = {f.id: f for f in part(read(SAMPLE.read_bytes()), OBJECTS)}
+    assert set(objects) == {"n-3", "n7", "n22", *(f"w{i}" for i in (*range(100, 107), 200, 201)), "r300"}
+    barn = objects["w200"]
+    assert barn.properties["kind"] == "building"
+    assert barn.geometry.geom_type == "Polygon"
+    assert objects["n-3"].properties["kind"] == "natural"
+    assert objects["w201"].geometry.geom_type == "LineString"
+    assert objects["n7"].geometry.is_empty
+    assert objects["r300"].properties["kind"] == "restriction"
+    assert objects["w104"].properties["osm"]["missing"] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({"highway": "path"}, "both"),
+        ({"oneway": "yes"}, "forward"),
+        ({"oneway": "true"}, "forward"),
+        ({"oneway": "1"}, "forward"),
+        ({"oneway": "reversible"}, "forward"),
+        ({"oneway": "-1"}, "backward"),
+        ({"oneway": "reverse"}, "backward"),
+        ({"junction": "roundabout"}, "forward"),
+        ({"junction": "roundabout", "oneway": "no"}, "both"),
+        ({"highway": "motorway"}, "forward"),
+        ({"highway": "motorway_link"}, "forward"),
+        ({"highway": "motorway", "oneway": "no"}, "both"),
+        ({"highway": "trunk"}, "both"),
+    ],
+)
+def test_direction(tags: dict[str, str], expected: str) -> None:
+    assert osm.direction(tags) == expected
+
+
+@pytest.mark.parametrize("pack", [gzip.compress, bz2.compress], ids=["gz", "bz2"])
+def test_compressed(pack: Callable[[bytes], bytes]) -> None:
+    data = pack(SAMPLE.read_bytes())
+    assert osm.detect("map.osm.gz", data)
+    assert write(read(data)) == write(read(SAMPLE.read_bytes()))
+    for cut in (5, len(data) // 2, len(data) - 1):
+        with pytest.raises(BadUpload):
+            read(data[:cut])
+    bomb = pack(b'<osm version="0.6">' + b" " * 20_000_000)
+    with pytest.raises(TooLarge):
+        read(bomb, limits=Limits(unpacked_bytes=1_000_000))
+    with pytest.raises(UnreadableFile):
+        read(bomb)
+
+
+def test_pbf_says_the_same_as_xml(tmp_path: Path) -> None:
+    import osmium
+
+    body = """<bounds minlat="50" minlon="7" maxlat="50.01" maxlon="7.01"/>
+     <node id="1" version="2" timestamp="2014-01-01T00:00:00Z" uid="5" user="ä" changeset="9"
+      lat="50.1234567" lon="-7.7"/>
+     <node id="2" version="1" lat="50.5" lon="-7.5"><tag k="highway" v="crossing"/></node>
+     <node id="3" lat="50.25" lon="-7.25"/><node id="4" lat="50.26" lon="-7.25"/>
+     <way id="10" version="4"><nd ref="1"/><nd ref="2"/><tag k="highway" v="path"/></way>
+     <way id="11"><nd ref="3"/><nd ref="4"/><nd ref="77"/><tag k="barrier" v="wall"/></way>
+     <relation id="20"><member type="way" ref="10" role="x"/><member type="node" ref="3" role=""/></relation>"""
+    source = xml(body, '<osm version="0.6" generator="me">')
+    path = tmp_path / "map.osm.pbf"
+    header = osmium.io.Header()
+    header.set("generator", "me")
+    header.add_box(osmium.osm.Box(7.0, 50.0, 7.01, 50.01))
+    with osmium.SimpleWriter(str(path), header=header) as writer:
+        for item in osmium.FileProcessor(osmium.io.FileBuffer(source, "osm")):
+            writer.add(item)
+    data = path.read_bytes()
+    assert osm.detect("anything", data)
+    ours, theirs = read(source), read(data)
+    assert set(ours.parts) == set(theirs.parts)
+    for key in ours.parts:
+        a, b = part(ours, key), part(theirs, key)
+        assert (a.ids, a.properties) == (b.ids, b.properties)
+        assert shapely.equals(a.geometry, b.geometry).all()
+        assert a.document["bounds"] == b.document["bounds"]
+    assert write(ours) == write(theirs)
+    for cut in (3, 20, len(data) // 2, len(data) - 5):
+        with pytest.raises(BadUpload):
+            read(data[:cut], ReadContext(main="map.osm.pbf")) if cut > 15 else read(data[:cut])
+    noise = random.Random(1)
+    for _ in range(40):
+        broken = bytearray(data)
+        for _ in range(3):
+            broken[noise.randrange(20, len(data))] = noise.randrange(256)
+        with suppress(BadUpload):
+            read(bytes(broken))
+
+
+# --- editing -----------------------------------------------------------------------------------------------------
+
+
+def edited(layers: Layers, change: Callable[[list[Any]], list[Any]]) -> Layers:
+    rows = [(f.id, f.geometry, f.properties) for f in part(layers, TOPOLOGY)]
+    return Layers({**layers.parts, TOPOLOGY: features(change(rows), "wgs84")}, layers.datum, layers.levels)
+
+
+def test_a_moved_node_is_written_where_it_is() -> None:
+    layers = read(SAMPLE.read_bytes())
+    place = shapely.Point(7.5, 50.5)
+    moved = edited(layers, lambda rows: [(i, place if i == "n2" else g, p) for i, g, p in rows])
+    out = elements(write(moved))
+    assert (out["n2"][0]["lon"], out["n2"][0]["lat"]) == ("7.5", "50.5")
+    assert out["w100"] == elements(write(layers))["w100"]
+
+
+def test_a_deleted_edge_splits_its_way(tmp_path: Path) -> None:
+    body = "".join(f'<node id="{i}" lat="50" lon="7.{i}"/>' for i in range(1, 6))
+    body += '<way id="9" version="2">' + "".join(f'<nd ref="{i}"/>' for i in range(1, 6))
+    body += '<tag k="highway" v="path"/></way><relation id="1"><member type="way" ref="9" role="r"/></relation>'
+    layers = read(xml(body))
+    gone = edited(layers, lambda rows: [r for r in rows if r[0] not in ("w9:2-3", "w9:3-2", "w9:4-3")])
+    served = write(gone)
+    out = elements(served)
+    assert refs(served, "w9") == ["1", "2"]
+    assert refs(served, "w-1") == ["3", "4"]
+    assert out["w-1"][2] == {"highway": "path", "oneway": "yes"}
+    assert refs(served, "w-2") == ["4", "5"]
+    assert out["w-2"][2] == {"highway": "path"}
+    assert [m["ref"] for m in out["r1"][1]] == ["9", "-1", "-2"]
+    before, after = network(gone), network(read(served))
+    assert {(a, b) for a, b, _ in before.edges} == {(a, b) for a, b, _ in after.edges}
+    check_with_osmium(served, tmp_path)
+
+
+def test_a_deleted_node_goes_and_one_that_bends_a_fence_stays() -> None:
+    layers = read(SAMPLE.read_bytes())
+    touched = {
+        "n1",
+        *(f.id for f in part(layers, TOPOLOGY) if "n1" in (f.properties.get("source"), f.properties.get("target"))),
+    }
+    served = write(edited(layers, lambda rows: [r for r in rows if r[0] not in touched]))
+    assert refs(served, "w100") == ["2", "3"]
+    assert refs(served, "w201") == ["20", "30", "1"], "the fence has its own course"
+    assert float(elements(served)["n1"][0]["lat"]) == 50.0
+
+
+def test_added_edges_become_a_way_and_other_tags_count(tmp_path: Path) -> None:
+    layers = read(SAMPLE.read_bytes())
+
+    def change(rows: list[Any]) -> list[Any]:
+        node = ("shed", shapely.Point(7.004, 50.004), {"kind": "node", "name": "Shed"})
+        ends = {"n5": shapely.Point(7.002, 50.001), "n1": shapely.Point(7, 50), "shed": node[1]}
+        new = [
+            (f"{a}_{b}", shapely.LineString([ends[a], ends[b]]), {"kind": "edge", "source": a, "target": b, **more})
+            for a, b, more in (
+                ("n5", "shed", {"speed_limit": 0.5}),
+                ("shed", "n5", {"speed_limit": 0.5}),
+                ("shed", "n1", {"width": 2}),
+            )
+        ]
+        tagged = [
+            (
+                i,
+                g,
+                {**p, "osm": {**p["osm"], "tags": {**p["osm"]["tags"], "surface": "mud"}}} if i[:5] == "w102:" else p,
+            )
+            for i, g, p in rows
+        ]
+        return [*tagged, node, *new]
+
+    served = write(edited(layers, change))
+    out = elements(served)
+    shed = next(k for k, v in out.items() if v[2].get("name") == "Shed")
+    assert int(shed[1:]) < 0
+    ways = {tuple(m["ref"] for m in v[1]): v[2] for k, v in out.items() if k.startswith("w-")}
+    assert ways[("5", shed[1:])] == {"highway": "path", "maxspeed": "1.8"}
+    assert ways[(shed[1:], "1")] == {"highway": "path", "width": "2", "oneway": "yes"}
+    assert out["w102"][2] == {"highway": "service", "oneway": "-1", "surface": "mud"}
+
+
+def test_another_network_replaces_the_streets_and_keeps_the_rest(tmp_path: Path) -> None:
+    layers = read(SAMPLE.read_bytes())
+    rows = [
+        ("n1", shapely.Point(0, 0), {"kind": "node"}),
+        ("B & <C>", shapely.Point(30, 0, 2.5), {"kind": "node", "tmap2": {"verts": []}}),
+        ("n1_B", shapely.LineString([(0, 0), (15, 5), (30, 0)]), {"kind": "edge", "source": "n1", "target": "B & <C>"}),
+    ]
+    datum = Datum(50.0, 7.0)
+    other = Layers({**layers.parts, TOPOLOGY: features(rows, "local")}, datum)
+    context = WriteContext()
+    served = write(other, context)
+    out = elements(served)
+    assert not {"w100", "w101"} & out.keys()
+    assert {"w200", "w201", "w106", "n22"} <= out.keys()
+    node = next(v for v in out.values() if v[2].get("name") == "B & <C>")
+    at = local_frame(datum).to_wgs84(np.array([[30.0, 0.0]]))[0]
+    assert np.allclose([float(node[0]["lon"]), float(node[0]["lat"])], at, atol=1e-11)
+    assert node[2]["ele"] == "2.5"
+    assert any("no longer in the network" in d["what"] for d in context.dropped)
+    graph = network(read(served))
+    assert sorted(d for _, d in graph.degree() if d) == [1, 1, 2], "the bend is a node, one way only"
+    with pytest.raises(MissingDatum):
+        write(Layers(other.parts))
+
+
+def test_a_redrawn_building_gets_new_corners() -> None:
+    layers = read(SAMPLE.read_bytes())
+    objects = part(layers, OBJECTS)
+    shape = shapely.Polygon([(7.003, 50.003), (7.0031, 50.003), (7.0031, 50.0031), (7.0035, 50.004), (7.003, 50.0031)])
+    rows = [(f.id, shape if f.id == "w200" else f.geometry, f.properties) for f in objects]
+    served = write(Layers({**layers.parts, OBJECTS: features(rows, "wgs84", objects.document)}))
+    again = {f.id: f for f in part(read(served), OBJECTS)}
+    assert again["w200"].geometry.equals(shape)
+    assert "22" in refs(served, "w200"), "its own node where one stands at a corner"
+
+
+def test_items_of_other_formats_get_tags() -> None:
+    square = shapely.box(7.0, 50.0, 7.001, 50.001)
+    holed = shapely.Polygon(square.exterior, [shapely.box(7.0002, 50.0002, 7.0004, 50.0004).exterior])
+    line = shapely.LineString([(7.0, 50.0), (7.1, 50.1)])
+    parts: dict[PartKey, Any] = {
+        PartKey("objects", "ground", "kml"): features(
+            [
+                ("field", square, {"kind": "region", "name": 'North "field"', "crop": "wheat", "kml": {"x": [1]}}),
+                ("pond", holed, {"kind": "region"}),
+                ("tree", shapely.Point(7.0, 50.0), {"kind": "poi", "height": 3.5, "alive": True}),
+                ("drawn", line, {"kind": "path"}),
+                ("text", None, {"kind": "note"}),
+            ],
+            "wgs84",
+        ),
+        PartKey("objects", "L2", "kml"): features([("up", line, {"kind": "path"})], "wgs84"),
+        PartKey("zones", "ground", ZONES): features([("z", square, {"kind": "keepout"})], "wgs84"),
+        PartKey("location", "ground", SITE): features([("fence", square, {"kind": "fence"})], "wgs84"),
+        TOPOLOGY: features(
+            [
+                ("drawn/0", shapely.Point(7.0, 50.0), {"kind": "node", "drawn_from": "drawn"}),
+                ("drawn/1", shapely.Point(7.1, 50.1), {"kind": "node", "drawn_from": "drawn"}),
+                ("e", line, {"kind": "edge", "source": "drawn/0", "target": "drawn/1", "drawn_from": "drawn"}),
+            ],
+            "wgs84",
+        ),
+    }
+    context = WriteContext(attribution=("© somebody",))
+    served = write(Layers(parts, Datum(50.0, 7.0), (Level(), Level("L2", 3.0))), context)
+    root = etree.fromstring(served)
+    assert root.get("attribution") == "© somebody"
+    assert dict(root.find("bounds").attrib) == {
+        "minlat": "50.0",
+        "minlon": "7.0",
+        "maxlat": "50.001",
+        "maxlon": "7.001",
+    }
+    said = [v[2] for v in elements(served).values()]
+    assert {"name": 'North "field"', "kind": "region", "crop": "wheat", "area": "yes"} in said
+    assert {"name": "pond", "kind": "region", "type": "multipolygon"} in said
+    assert {"name": "tree", "kind": "poi", "height": "3.5", "alive": "yes"} in said
+    assert {"name": "z", "kind": "keepout", "zone": "keepout", "area": "yes"} in said
+    assert {"name": "up", "kind": "path", "level": "L2"} in said
+    assert not any(t.get("name") == "drawn" for t in said), "the network made from it stands there already"
+    lost = {d["what"] for d in context.dropped}
+    assert {"GNSS fence", "datum", "items without a geometry"} <= lost
+    assert any("nested" in what for what in lost)
+
+
+def test_two_levels_with_the_same_ids_do_not_melt() -> None:
+    ground, upper = read(SAMPLE.read_bytes()), read(SAMPLE.read_bytes(), level="L2")
+    shifted = Layers(
+        {
+            k: features(
+                [(f.id, shapely.transform(f.geometry, lambda c: c + 0.5), f.properties) for f in part(upper, k)],
+                "wgs84",
+            )
+            for k in upper.parts
+        }
+    )
+    served = write(Layers({**ground.parts, **shifted.parts}))
+    graph = network(read(served))
+    single = network(ground)
+    assert graph.number_of_nodes() == 2 * single.number_of_nodes()
+    assert networkx.number_weakly_connected_components(graph) == 2 * networkx.number_weakly_connected_components(single)
+
+
+def test_properties_that_anybody_edited_do_no_harm() -> None:
+    said: list[dict[str, Any]] = [
+        {"refs": "1,2", "tags": {"a": 1}},
+        {"refs": [1.5, None], "tags": []},
+        {"refs": [True], "tags": {"highway": "path"}},
+        {"refs": [10**30]},
+        {
+            "refs": [1, 2],
+            "missing": ["x"],
+            "vertices": [1],
+            "tags": {"k\x01": "v\ud800\n"},
+            "attributes": {"bad name": "x", "id": "9"},
+        },
+    ]
+    line = shapely.LineString([(7, 50), (7.1, 50)])
+    rows: list[Any] = [(f"w{k + 1}", line, {"kind": "line", "osm": s}) for k, s in enumerate(said)]
+    rows += [
+        ("r1", None, {"osm": {"members": [["way"], "x", ["way", "1", "r"], ["node", 1, 5]]}}),
+        ("n0x", line, {"osm": 5}),
+    ]
+    served = write(Layers({OBJECTS: features(rows, "wgs84")}))
+    assert len(etree.fromstring(served)) > 5
+    assert read(served)
+
+
+# --- hostile bytes -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ('<node id="1" lat="NaN" lon="1"/>', "finite"),
+        ('<node id="1" lat="inf" lon="1"/>', "finite"),
+        ('<node id="1" lat="1e999" lon="1"/>', "no place on earth"),
+        ('<node id="1" lat="90.1" lon="1"/>', "no place on earth"),
+        ('<node id="1" lat="1" lon="-180.5"/>', "no place on earth"),
+        ('<node id="1" lat="1_0" lon="1"/>', "finite"),
+        ('<node id="1" lat="١" lon="1"/>', "finite"),
+        ('<node lat="1" lon="1"/>', "id"),
+        ('<node id="x" lat="1" lon="1"/>', "id"),
+        ('<node id="99999999999999999999" lat="1" lon="1"/>', "id"),
+        ('<node id="9223372036854775808" lat="1" lon="1"/>', "64 bits"),
+        ('<way id="1"><nd ref="9999999999999999999"/></way>', "64 bits"),
+        ('<way id="1"><nd/></way>', "ref"),
+        ('<relation id="1"><member type="area" ref="1" role=""/></relation>', "member"),
+        ('<bounds minlat="5" minlon="1" maxlat="4" maxlon="2"/>', "bounds"),
+        ('<bounds minlat="nan" minlon="1" maxlat="4" maxlon="2"/>', "bounds"),
+        ('<way id="1"><way id="2"><nd ref="1"/></way></way>', "no part"),
+        ('<node id="1" lat="1" lon="1" user="' + "x" * 70_000 + '"/>', "longer"),
+        ("<a>" * 300 + "</a>" * 300, "no element"),
+        ('<node id="1" lat="1" lon="1">&bomb;</node>', ""),
+        ('<node id="1" lat="1" lon="1" id="2"/>', ""),
+        ("<node id='1' lat='1' lon='1'/>\x00", ""),
+    ],
+)
+def test_bad_content_is_refused_with_a_reason(body: str, reason: str) -> None:
+    with pytest.raises(UnreadableFile) as refused:
+        read(xml(body))
+    assert reason in refused.value.detail
+    assert refused.value.problems
+
+
+@pytest.mark.parametrize("quote", ['"', "'"])
+def test_a_bad_place_is_named_with_its_line(quote: str) -> None:
+    lines = "\n".join(f'<node id="{k}" lat="{89 + k}" lon="1"/>' for k in range(4)).replace('"', quote)
+    with pytest.raises(UnreadableFile) as refused:
+        read(xml(lines))
+    assert (refused.value.problems[0].line, refused.value.problems[0].where) == (5, "node 2")
+
+
+def test_entities_are_refused_in_any_encoding() -> None:
+    bomb = '<!DOCTYPE osm [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><osm version="0.6"><note>&b;</note></osm>'
+    for text in (bomb, "<?xml version='1.0'?>\n" + bomb, "<!-- x -->" + bomb):
+        for encoding in ("utf-8", "utf-16"):
+            if encoding == "utf-16" and text[:5] == "<?xml":
+                continue
+            with pytest.raises(UnreadableFile):
+                read(text.encode(encoding))
+
+
+def test_other_encodings_and_layouts_are_read() -> None:
+    text = '<osm version="0.6"><node id="1" lat="1" lon="2"><tag k="name" v="Zoë"/></node></osm>'
+    expected = read(text.encode())
+    for data in (
+        ('<?xml version="1.0" encoding="ISO-8859-1"?>' + text).encode("latin-1"),
+        text.encode("utf-16"),
+        b"\xef\xbb\xbf" + text.encode(),
+        b"\n \n" + text.encode(),
+        text.replace('"', "'").encode(),
+        text.replace("><", "><!-- <node id='9'/> --><").encode(),
+        text.replace('"Zoë"', '"Zo&#235;"').encode(),
+        text.replace('<tag k="name" v="Zoë"/>', "<tag\nv = 'Zoë'\n k='name' ></tag>").encode(),
+    ):
+        found = part(read(data), OBJECTS)
+        assert found.ids == part(expected, OBJECTS).ids
+        assert found.properties == part(expected, OBJECTS).properties
+        assert osm.detect("x", data)
+
+
+def test_what_is_detected() -> None:
+    assert osm.detect("a", SAMPLE.read_bytes())
+    assert osm.detect("a", b'<!DOCTYPE osm [<!ENTITY a "b">]><osm/>'), "so that the reader can say what is wrong"
+    assert not osm.detect("a", b"<!---->" * 500)
+    assert not osm.detect("a.osm", b"")
+    assert not osm.detect("a.osm", b"<kml><osm/></kml>")
+    assert not osm.detect("a.osm", gzip.compress(b"hello"))
+    assert not osm.detect("a", b'{"osm": "<osm>"}')
+
+
+def test_truncated_and_mutated_files_never_crash(shared: Path) -> None:
+    real = (shared / "data/osm" / REAL[0] / "osm.xml").read_bytes()
+    noise = random.Random(7)
+    for data in (SAMPLE.read_bytes(), real[:200_000] + b"</osm>"):
+        for cut in [noise.randrange(len(data) - 8) for _ in range(20)]:
+            with pytest.raises(BadUpload):
+                read(data[:cut])
+        for _ in range(60):
+            broken = bytearray(data)
+            for _ in range(noise.randrange(1, 4)):
+                broken[noise.randrange(len(data))] = noise.choice(b"<>\"'&0z \x00\xff")
+            with suppress(BadUpload):
+                write(read(bytes(broken)))
+
+
+def test_counts_are_bounded() -> None:
+    many = xml("".join(f'<node id="{k}" lat="1" lon="1"/>' for k in range(1, 2000)))
+    assert read(many)
+    with pytest.raises(TooLarge):
+        read(many, limits=Limits(features=200))
+    with pytest.raises(TooLarge):
+        read(many.replace(b'"1"', b"'1'"), limits=Limits(features=200))
+
+
+def test_memory_stays_within_ten_times_the_input() -> None:
+    nodes = "".join(f' <node id="{k}" version="1" lat="50.{k:06d}" lon="7.{k:06d}"/>\n' for k in range(1, 16_000))
+    ways = "".join(
+        f' <way id="{w}">\n'
+        + "".join(f'  <nd ref="{w * 8 + j}"/>\n' for j in range(9))
+        + '  <tag k="natural" v="x"/>\n </way>\n'
+        for w in range(1, 1_600)
+    )
+    for data in (xml(nodes + ways), xml(nodes + ways).replace(b'"1"', b"'1'")):
+        tracemalloc.start()
+        read(data)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 10 * len(data)
