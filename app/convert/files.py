@@ -15,7 +15,7 @@ from app.errors import MissingLayer, Problem
 from app.formats import Files, Limits
 from app.model.features import Features
 from app.model.frame import Datum
-from app.model.layers import Layers, PartKey
+from app.model.layers import Layer, Layers, PartKey
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +46,14 @@ def offline(
     limits = limits or Limits()
     unpacked = bundle.unpack(files, limits)
     hints = hints or Hints()
-    carried = None if "objects" in known.carries else known.carries
-    told = bundle.read(unpacked, hints, Known(datum, None, carried, not known.outlines), limits)
+    needed: frozenset[Layer] = frozenset().union(*known.needs.one_of)
+    wanted = None if "objects" in needed else needed  # whatever can be read can be an object
+    told = bundle.read(unpacked, hints, Known(datum, None, wanted, not known.outlines), limits)
     layers = told.layers(datum)
     try:
         way = recipes.chain(known, _stock(layers), write_options, derived=derived)
     except MissingLayer:
-        if carried is None:
+        if wanted is None:
             raise
         # What the format carries is not in the files: read all they have, to derive it from.
         told = bundle.read(unpacked, hints, Known(datum, None, None, not known.outlines), limits)
