@@ -77,12 +77,15 @@ SLOT = re.compile(r"<\?(c|n|d ([^?]*))\?>")
 # misread as Latin-1 (and such characters keep a Python text at one byte a character). A file that has them is refused.
 _M_ITEM, _M_COORDINATES, _M_NAME, _M_DATA, _M_END = ("\x91\x9c\x82" + chr(0x86 + k) for k in range(5))
 
-_NUMBER_BYTES = np.zeros(256, bool)
-_NUMBER_BYTES[list(b"0123456789+-.eE")] = True
-_BLANK_BYTES = np.zeros(256, bool)
-_BLANK_BYTES[list(b" \t\r\n")] = True
+_BLANK, _CUT, _COMMA, _DIGIT, _OTHER = range(5)
+_CLASSES = bytearray([_OTHER] * 256)
+for _byte in b" \t\r\n":
+    _CLASSES[_byte] = _BLANK
+for _byte in b"0123456789+-.eE":
+    _CLASSES[_byte] = _DIGIT
+_CLASSES[ord(",")], _CLASSES[ord(";")] = _COMMA, _CUT
+_SPACES = bytes.maketrans(b",;", b"  ")
 
-OVERLAY_TOLERANCE = 1e-11
 MOVED = 1e-8
 """Degrees (a millimetre): an item of ours whose drawn place differs more from its exact metres has been moved."""
 
@@ -120,41 +123,55 @@ class Sequences:
 
 def parse_coordinates(texts: Sequence[str]) -> Sequences:
     """Coordinate texts -> numbers, all at once; what is not plain is marked, not refused."""
-    joined = ";".join(texts).encode()
-    raw = np.frombuffer(joined + b";", np.uint8)
-    comma, cut = raw == ord(","), raw == ord(";")
-    blank = _BLANK_BYTES[raw] | cut
-    odd = np.zeros(len(texts), bool)
-    cuts = np.flatnonzero(cut)
+    joined = ";".join(texts).encode() + b";"
+    classes = joined.translate(_CLASSES)
+    kind = np.frombuffer(classes, np.uint8)
+    cuts = np.flatnonzero(kind == _CUT)
     if len(cuts) != len(texts):
         return _one_by_one(texts)
-    inside = ~blank
-    begins = np.flatnonzero(inside & np.concatenate([[True], blank[:-1]]))
-    text_of = np.searchsorted(cuts, begins)
-    commas = np.flatnonzero(comma)
-    token_of = np.searchsorted(begins, commas, "right") - 1
-    size = np.bincount(token_of, minlength=len(begins)) + 1
-    odd[text_of[(size != 2) & (size != 3)]] = True
+    odd = np.zeros(len(texts), bool)
+    inside = kind >= _COMMA
+    begins = np.flatnonzero(inside[1:] > inside[:-1]) + 1
+    if inside[0]:
+        begins = np.concatenate([[0], begins])
+    commas = np.flatnonzero(kind == _COMMA)
+    # Commas before the n-th tuple begins: their differences are the commas within each.
+    size = np.diff(np.searchsorted(commas, begins), append=len(commas)) + 1
+    strange = begins[(size != 2) & (size != 3)]
+    if len(strange):
+        odd[np.searchsorted(cuts, strange)] = True
     # A comma needs a number on either side; other characters are no numbers.
-    after = raw[np.minimum(commas + 1, len(raw) - 1)]
-    before = raw[np.maximum(commas - 1, 0)]
-    odd[np.searchsorted(cuts, commas[~(_NUMBER_BYTES[after] & _NUMBER_BYTES[before])])] = True
-    odd[np.searchsorted(cuts, np.flatnonzero(~(_NUMBER_BYTES[raw] | comma | blank)))] = True
+    alone = commas[(kind[commas + 1] != _DIGIT) | (kind[commas - 1] != _DIGIT)]
+    odd[np.searchsorted(cuts, alone)] = True
+    if bytes([_OTHER]) in classes:
+        odd[np.searchsorted(cuts, np.flatnonzero(kind == _OTHER))] = True
     if odd.any():
         plain = parse_coordinates(["" if bad else t for t, bad in zip(texts, odd.tolist(), strict=True)])
         return Sequences(plain.points, plain.start, odd | plain.odd)
     try:
-        values = np.array(list(map(float, joined.translate(bytes.maketrans(b",;", b"  ")).split())), np.float64)
+        values = np.array(list(map(float, joined.translate(_SPACES).split())), np.float64)
     except ValueError:
         return _one_by_one(texts)
-    points = np.zeros((len(begins), 3))
-    if len(begins):
-        first = np.concatenate([[0], np.cumsum(size)[:-1]]).astype(np.int64)
+    if len(values) == 3 * len(begins) and (size == 3).all():
+        points = values.reshape(-1, 3)
+    else:
+        points = np.zeros((len(begins), 3))
+        first = np.cumsum(size) - size
         points[:, 0], points[:, 1] = values[first], values[first + 1]
         deep = size == 3
         points[deep, 2] = values[first[deep] + 2]
-    start = np.searchsorted(text_of, np.arange(len(texts) + 1))
+    start = np.concatenate([[0], np.searchsorted(begins, cuts)])
     return Sequences(points, start, odd)
+
+
+def _there_and_back(parsed: Sequences, rings: Sequence[int]) -> Sequences:
+    """The same with these rings of three points (an edge drawn as an area: there and back) made ones of four, as few as
+    a ring can have, by giving their second point twice.
+    """
+    times = np.ones(len(parsed.points), np.int64)
+    times[parsed.start[list(rings)] + 1] = 2
+    before = np.concatenate([[0], np.cumsum(times)])
+    return Sequences(np.repeat(parsed.points, times, axis=0), before[parsed.start], parsed.odd)
 
 
 def _one_by_one(texts: Sequence[str]) -> Sequences:
@@ -400,6 +417,7 @@ class _Item:
     """A placemark or overlay while its tree is read."""
 
     element: etree._Element
+    title: etree._Element | None = None
     data: tuple[tuple[str, etree._Element], ...] = ()
     geometries: tuple[etree._Element, ...] = ()
     sequences: tuple[tuple[str, int, etree._Element], ...] = ()
@@ -479,6 +497,10 @@ class _Reader:
         ours: list[tuple[etree._Element, dict[str, str]]],
     ) -> None:
         items = _items(root)
+        for schema in root.iter("{*}Schema"):
+            if schema.get("parent"):
+                what = f"<{schema.get('name', '')[:80]}> elements, placemarks of KML's oldest Schema form,"
+                self.context.warn(f"{what} are kept but not read as objects", line=schema.sourceline)
         parsed = self._sequences(items)
         _check_places(items, parsed)
         mine, theirs = [], []
@@ -617,11 +639,15 @@ class _Reader:
             return Sequences(np.empty((0, 3)), np.zeros(1, np.int64), np.zeros(0, bool))
         parsed = parse_coordinates(texts)
         count = np.diff(parsed.start)
-        least = {"P": 1, "L": 2, "R": 4}
+        least = {"P": 1, "L": 2, "R": 3}
         closed = np.zeros(len(texts), bool)
         full = count > 0
         ends = parsed.points[parsed.start[1:][full] - 1]
         closed[full] = (parsed.points[parsed.start[:-1][full]] == ends).all(axis=1)
+        # A ring that is "there and back" already in four points would be taken for one of three (see _there_and_back).
+        four = np.flatnonzero(count == 4)
+        second = parsed.points[parsed.start[four] + 1]
+        closed[four[(second == parsed.points[parsed.start[four] + 2]).all(axis=1)]] = False
         counts, odd, closes = count.tolist(), parsed.odd.tolist(), closed.tolist()
         strange = []
         for item in items:
@@ -638,7 +664,8 @@ class _Reader:
                 line=strange[0].sourceline,
                 where=child_text(strange[0], "name")[:200] or None,
             )
-        return parsed
+        rings = [k for item in items for role, k, _ in item.sequences if role == "R" and counts[k] == 3]
+        return _there_and_back(parsed, rings) if rings else parsed
 
     def _keep(
         self,
@@ -823,6 +850,10 @@ def _items(root: etree._Element) -> list[_Item]:
         owner = index.get(g.getparent())
         if owner is not None:
             owner.geometries += (g,)
+    for tag in root.iter("{*}name"):
+        owner = index.get(tag.getparent())
+        if owner is not None and owner.title is None:
+            owner.title = tag
     for extended in root.iter("{*}ExtendedData"):
         owner = index.get(extended.getparent())
         if owner is not None:
@@ -967,7 +998,7 @@ def _identify(
     titles: list[tuple[etree._Element, str] | None] = []
     ids = []
     for item, attribute in zip(items, attributes, strict=True):
-        tag = child(item.element, "name")
+        tag = item.title
         title = None if tag is None or len(tag) else (tag, (tag.text or "").strip())
         titles.append(title)
         if attribute and counts[attribute] == 1:

@@ -165,8 +165,12 @@ class _Texts:
 _LETTERS = {0: "P", 1: "L", 2: "L"}
 
 
-def _coordinate_texts(geometry: NDArray[np.object_], decimals: int, form: Callable[..., str], glue: str) -> _Texts:
-    """All coordinates as text at once. form: joins the numbers of one position; glue: stands between positions."""
+def _coordinate_texts(
+    geometry: NDArray[np.object_], decimals: int, form: Callable[..., str], glue: str, *, thin: bool = False
+) -> _Texts:
+    """All coordinates as text at once. form: joins the numbers of one position; glue: stands between positions. thin:
+    rings that were drawn as three points get back to three.
+    """
     parts, owner = shapely.get_parts(geometry, return_index=True)
     while len(parts) and (shapely.get_type_id(parts) > 3).any():
         parts, inner = shapely.get_parts(parts, return_index=True)
@@ -191,6 +195,14 @@ def _coordinate_texts(geometry: NDArray[np.object_], decimals: int, form: Callab
         positions = list(map(form, *columns))
     bounds = np.searchsorted(list_of, np.arange(len(lists) + 1)).tolist()
     texts = [glue.join(positions[a:b]) for a, b in pairwise(bounds)]
+    if thin:
+        begin = np.array(bounds[:-1], np.int64)
+        four = np.flatnonzero(from_area & (np.diff(bounds) == 4))
+        known = np.nan_to_num(points)
+        back = four[(known[begin[four] + 1] == known[begin[four] + 2]).all(axis=1)]
+        for k in back.tolist():
+            a = bounds[k]
+            texts[k] = glue.join([positions[a], positions[a + 1], positions[a + 3]])
     places = np.searchsorted(owner[part_of], np.arange(len(geometry) + 1)).tolist()
     words = [_LETTERS.get(t, f"A{n}") for t, n in zip(types.tolist(), count.tolist(), strict=True)]
     own = np.searchsorted(owner, np.arange(len(geometry) + 1)).tolist()
@@ -210,8 +222,8 @@ def _bracket(*numbers: str) -> str:
     return f"[{','.join(numbers)}]"
 
 
-def _degrees(geometry: NDArray[np.object_]) -> _Texts:
-    return _coordinate_texts(geometry, _text.DEGREES, _comma, " ")
+def _degrees(geometry: NDArray[np.object_], *, thin: bool = False) -> _Texts:
+    return _coordinate_texts(geometry, _text.DEGREES, _comma, " ", thin=thin)
 
 
 def _element(geometry: Any, lists: Iterator[str], extra: str = "") -> str:
@@ -436,7 +448,7 @@ def _drawings(key: PartKey, part: Features, frame: LocalFrame | None) -> tuple[l
     known = said.get("documents") if isinstance(said, Mapping) else None
     known = known if isinstance(known, Mapping) else {}
     geometry = part.in_wgs84(frame)
-    texts = _degrees(geometry)
+    texts = _degrees(geometry, thin=True)
     placed: dict[str, list[tuple[int, int, str]]] = {name: [] for name in known}
     loose = []
     roots = {name: _declarations(document["xml"]) for name, document in known.items()}
