@@ -80,12 +80,14 @@ def offline_paths(
 
 def _stock(layers: Layers) -> recipes.Stock:
     keys: set[PartKey] = set()
+    blank: set[PartKey] = set()
     anchors: dict[PartKey, frozenset[str]] = {}
     for key, part in layers.parts.items():
         if isinstance(part, Features):
             if not len(part):
+                blank.add(key)
                 continue
             some = {"local"} if part.local.any() else set()
             anchors[key] = frozenset(some | ({"wgs84"} if part.needs_datum else set()))
         keys.add(key)
-    return recipes.Stock(frozenset(keys), layers.datum is not None, anchors)
+    return recipes.Stock(frozenset(keys), layers.datum is not None, anchors, frozenset(blank))

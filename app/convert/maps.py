@@ -13,7 +13,7 @@ from app.convert import make as making
 from app.convert import recipe as recipes
 from app.convert.cache import Cache, Made, Product
 from app.convert.recipe import Recipe
-from app.errors import CannotConvert, FleetMapError, UnreadableFile
+from app.errors import Ambiguous, CannotConvert, FleetMapError, UnreadableFile
 from app.formats import Limits
 from app.model.frame import Datum
 from app.pool import WorkerDied
@@ -70,6 +70,8 @@ class Maps:
             line: dict[str, Any] = {"format": known.name, "state": "missing", "chain": [], "missing": []}
             try:
                 way = recipes.chain(known, available, known.write_options())
+            except Ambiguous as error:  # it can be made, once the caller says which one
+                line |= {"state": "direct", "choose": error.detail}
             except FleetMapError as error:
                 line["missing"] = recipes.missing(known, available) or [error.detail]
             else:

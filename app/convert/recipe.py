@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import orjson
@@ -35,11 +35,21 @@ SUPPLY: Mapping[Layer, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Stock:
-    """What there is to make maps from: the parts that have content, and whether there is a datum."""
+    """What there is to make maps from: the parts that have content, and whether there is a datum.
+
+    anchors: of each part, which of ``local`` and ``wgs84`` its items are. blank: parts without items; an empty file is
+    a map of its own format, and of no other.
+    """
 
     keys: frozenset[PartKey]
     datum: bool
     anchors: Mapping[PartKey, frozenset[str]] = field(default_factory=dict)
+    blank: frozenset[PartKey] = frozenset()
+
+    def seen_by(self, known: Format) -> Stock:
+        """The same with the blank parts that came from this format."""
+        own = {k for k in self.blank if k.name == known.family}
+        return replace(self, keys=self.keys | own, blank=frozenset()) if own else self
 
     @property
     def layers(self) -> frozenset[Layer]:
@@ -80,11 +90,13 @@ def stock(version: Version) -> Stock:
     """What a version holds."""
     entries = [e for e in version.parts if e.count > 0]
     anchors = {e.key: frozenset(name for name, box in (e.bounds or {}).items() if box) for e in entries}
-    return Stock(frozenset(e.key for e in entries), version.datum is not None, anchors)
+    blank = frozenset(e.key for e in version.parts if not e.count)
+    return Stock(frozenset(e.key for e in entries), version.datum is not None, anchors, blank)
 
 
 def chain(known: Format, available: Stock, options: Any, *, derived: bool = True) -> Chain:
     """The cheapest way to a format. MissingLayer or MissingDatum say what to supply; Ambiguous names the choices."""
+    available = available.seen_by(known)
     if known.needs.datum and not available.datum:
         raise MissingDatum(f"{known.name} needs {SUPPLY['location']}")
     best: derive.Plan | None = None
