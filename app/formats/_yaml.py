@@ -303,7 +303,7 @@ class _NotSimpleError(Exception):
 
 _LINE = re.compile(
     rf"""
-    (?P<indent>\ *) (?P<dash>-\ +)?
+    (?P<indent>\ *+) (?P<dash>-\ ++)?
     (?:
         (?P<key> [A-Za-z_0-9$/](?:[ !"$-9;-~{_WIDE}]{{0,200}}(?<!\ ))? | '[ -&(-~{_WIDE}]{{1,200}}' ) :
         (?:\ +(?=\S) | \ *$)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, Format, Needs, ReadContext, WriteContext, _yaml, register
-from app.formats._text import DEGREES, number
+from app.formats._text import DEGREES
 from app.model.features import Features, features
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum
 from app.model.grid import OccupancyGrid
@@ -164,7 +164,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     if datum is None or frame is None:
         raise ValueError("a datum is needed")
     fence, document, closed = _chosen(layers, context)
-    latitude, longitude = _text(datum.latitude), _text(datum.longitude)
+    latitude, longitude = _yaml.text(datum.latitude), _yaml.text(datum.longitude)
     out = [HEAD, f"datum_latitude: {latitude}\ndatum_longitude: {longitude}\n"]
     if datum.altitude:
         out.append(f"datum_altitude: {_yaml.text(datum.altitude)}\n")
@@ -174,7 +174,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         context.warn("the environment has no fence: gnss_fence_coords is empty", where="gnss_fence.gnss_fence_coords")
         pairs = []
     else:
-        pairs = [f"[{_text(y)}, {_text(x)}]" for x, y in (ring if closed else ring[:-1]).tolist()]
+        pairs = [f"[{_yaml.text(y)}, {_yaml.text(x)}]" for x, y in (ring if closed else ring[:-1]).tolist()]
     out.append(f"gnss_fence:\n  gnss_fence_coords: [{', '.join(pairs)}]\n")
     more_fence = document.pop("gnss_fence", None)
     if isinstance(more_fence, dict) and more_fence:
@@ -195,10 +195,6 @@ _KNOWN = frozenset(
 )
 
 
-def _text(degrees: float) -> str:
-    return _yaml.decimal(number(degrees, DEGREES))
-
-
 def _chosen(layers: Layers, context: WriteContext) -> tuple[Any, dict[str, Any], bool]:
     """(the fence as a polygon in degrees or None, the source's other keys, whether its first point was repeated)."""
     known: dict[str, Any] = {}
@@ -208,7 +204,12 @@ def _chosen(layers: Layers, context: WriteContext) -> tuple[Any, dict[str, Any],
         said = part.document.get(NAME)
         if isinstance(said, dict) and not known:
             known = dict(said)
-        for feature, place in zip(part, part.in_wgs84(layers.frame), strict=True):
+        places = part.in_wgs84(layers.frame)
+        if part.local.any():
+            # Computed degrees are rounded, so that every machine prints the same; given ones are written as given.
+            places = places.copy()
+            places[part.local] = shapely.transform(places[part.local], lambda xy: np.round(xy, DEGREES) + 0.0)
+        for feature, place in zip(part, places, strict=True):
             own = feature.properties.get(NAME)
             closed = isinstance(own, dict) and own.get("closed") is True
             pieces = list(place.geoms) if place.geom_type == "MultiPolygon" else [place]
@@ -301,7 +302,7 @@ def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) ->
     # The source's own yaw where it says the same: it may be several turns, and has digits that degrees would lose.
     if isinstance(yaw, bool) or not isinstance(yaw, (int, float)) or _heading(yaw) != datum.heading:
         yaw = -math.radians(datum.heading) + 0.0
-    values = [_text(datum.latitude), _text(datum.longitude), *map(_yaml.text, [yaw, *more])]
+    values = [_yaml.text(datum.latitude), _yaml.text(datum.longitude), *map(_yaml.text, [yaw, *more])]
     return _ordered({**NAVSAT, **navsat}, 2, tuple(NAVSAT)) + f"  datum: [{', '.join(values)}]\n"
 
 

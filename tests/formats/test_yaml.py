@@ -1,0 +1,355 @@
+"""YAML: what scalars mean, what is refused and on which line, and that the quick way and libyaml's agree."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import orjson
+import pytest
+import ryml
+import yaml
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from app.errors import BadUpload, TooLarge, UnreadableFile
+from app.formats import Limits, _yaml
+
+LIMITS = Limits()
+
+
+def load(said: str | bytes) -> Any:
+    return _yaml.load(said.encode() if isinstance(said, str) else said, LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("said", "value"),
+    [
+        ("1", 1),
+        ("-7", -7),
+        ("+3", 3),
+        ("0", 0),
+        ("1.5", 1.5),
+        ("1.", 1.0),
+        (".5", 0.5),
+        ("-.5", -0.5),
+        ("1.0e-05", 1e-05),
+        ("1e-05", 1e-05),
+        ("1.5e3", 1500.0),
+        ("1e+16", 1e16),
+        ("7e12", "7e12"),
+        ("0x1F", 31),
+        ("9223372036854775807", 2**63 - 1),
+        ("-9223372036854775808", -(2**63)),
+        ("08", "08"),
+        ("010", "010"),
+        ("0o17", "0o17"),
+        ("0b11", "0b11"),
+        ("1_2", "1_2"),
+        ("12:30", "12:30"),
+        ("190:20:30", "190:20:30"),
+        ("2022-06-23", "2022-06-23"),
+        ("2022-06-23_13-10-11", "2022-06-23_13-10-11"),
+        ("2001-12-14t21:59:43.10-05:00", "2001-12-14t21:59:43.10-05:00"),
+        ("yes", True),
+        ("True", True),
+        ("OFF", False),
+        ("no", False),
+        ("y", "y"),
+        ("tRUE", "tRUE"),
+        ("~", None),
+        ("null", None),
+        ("", None),
+        ("''", ""),
+        ("'True'", "True"),
+        ('"1"', "1"),
+        ("'it''s'", "it's"),
+        ('"a\\u00e9\\n"', "aé\n"),
+        ("!!str 1", "1"),
+        ("!!float 1", 1.0),
+        ("!!int 7", 7),
+        ("! 1", "1"),
+        ("nan", "nan"),
+        ("=", "="),
+        ("robot_short | robot_hunter", "robot_short | robot_hunter"),
+        ("[1, [2, {a: b}], 'c']", [1, [2, {"a": "b"}], "c"]),
+    ],
+)
+def test_what_a_scalar_means(said: str, value: Any) -> None:
+    read = load(f"key: {said}\n")
+    assert read == {"key": value}
+    assert type(read["key"]) is type(value)
+
+
+def test_keys_are_texts_as_written() -> None:
+    assert load("0: a\nyes: b\n2022-01-01: c\n~: d\n'<<': e\n1.50: f\n") == {
+        "0": "a", "yes": "b", "2022-01-01": "c", "~": "d", "<<": "e", "1.50": "f",
+    }  # fmt: skip
+
+
+def test_aliases_and_a_byte_order_mark() -> None:
+    said = "\ufeffa: &a [1, 2]\nb: *a\nc: &t text\nd: {e: *t}\nf: &a 3\ng: *a\n"
+    assert load(said) == {"a": [1, 2], "b": [1, 2], "c": "text", "d": {"e": "text"}, "f": 3, "g": 3}
+
+
+def test_lines_may_end_as_windows_ends_them() -> None:
+    assert load("a:\r\n- b: 1\r\n  c: x y\r\n") == {"a": [{"b": 1, "c": "x y"}]}
+
+
+@pytest.mark.parametrize(
+    ("said", "line", "part"),
+    [
+        ("a: 1\nb: .nan\n", 2, "finite"),
+        ("a: -.inf\n", 1, "finite"),
+        ("a: 1.0e+999\n", 1, "range"),
+        ("a: 9223372036854775808\n", 1, "64 bit"),
+        ("a: 0xFFFFFFFFFFFFFFFFF\n", 1, "64 bit"),
+        ("a:\n- " + "9" * 5000 + "\n", 2, "characters"),
+        ("a: 1\nb: 2\na: 3\n", 3, "twice"),
+        ("a: {b: 1, b: 2}\n", 1, "twice"),
+        ("a: 1\n1: x\n'1': y\n", 3, "twice"),
+        ("a: &a {b: 1}\nc:\n  <<: *a\n", 3, "merge"),
+        ("a: 1\n---\nb: 1\n", 2, "second document"),
+        ("a: !!python/object/apply:os.system [ls]\n", 1, "tag"),
+        ("a: !!python/name:os.system\n", 1, "tag"),
+        ("a: !foo b\n", 1, "tag"),
+        ("a: !!binary aGk=\n", 1, "tag"),
+        ("a: !!timestamp 2001-01-01\n", 1, "tag"),
+        ("a: !!int 010\n", 1, "tag"),
+        ("a: !!int yes\n", 1, "tag"),
+        ("!!set {a}\n", 1, "tag"),
+        ("%TAG !e! tag:example.org,2000:\n--- \na: !e!b c\n", 1, "%TAG"),
+        ("a: *b\n", 1, "anchor"),
+        ("a: &a [*a]\n", 1, "inside"),
+        ("a: &a\n  b: *a\n", 2, "inside"),
+        ("[1]: 2\n", 1, "collection"),
+        ("? {a: b}\n: 2\n", 1, "collection"),
+        ("a:\n\t- b\n", 2, "character"),
+        ("a: b: c\n", 1, "not allowed"),
+        ("a: [1, 2\n", 2, "flow"),
+        ("a: 'b\n", 2, "scalar"),
+        ('a: "\\ud800"\n', 1, "Unicode"),
+        ("a: 1\n  b: 2\n", 2, "not allowed"),
+    ],
+)
+def test_what_is_refused_and_where(said: str, line: int, part: str) -> None:
+    with pytest.raises(UnreadableFile, match=part) as caught:
+        load(said)
+    assert caught.value.problems[0].line == line
+    assert part in caught.value.problems[0].problem
+
+
+def test_bytes_that_are_no_text() -> None:
+    with pytest.raises(UnreadableFile, match="UTF-8") as caught:
+        load(b"a: 1\nb: \xff\n")
+    assert caught.value.problems[0].line == 2
+    with pytest.raises(UnreadableFile, match="control characters"):
+        load(b"a: \x00\n")
+    with pytest.raises(UnreadableFile):
+        load(b"a: \xed\xa0\x80\n")  # a lone surrogate
+    with pytest.raises(UnreadableFile):
+        load("a: 1".encode("utf-16"))
+
+
+@pytest.mark.parametrize("opening", ["[", "{", "{a: ", "- ", "? ", "[a, ", "[{a: ", "&a [", "!!seq ["])
+def test_deep_nesting_is_refused_at_once(opening: str) -> None:
+    began = time.perf_counter()
+    with pytest.raises(UnreadableFile):
+        load(opening * 60_000)
+    assert time.perf_counter() - began < 2
+
+
+def test_deep_block_nesting_ends_at_the_limit() -> None:
+    def nested(depth: int) -> str:
+        return "".join(f"{' ' * k}a:\n" for k in range(depth))
+
+    assert load(nested(LIMITS.yaml_depth)) is not None
+    with pytest.raises(UnreadableFile, match="48 levels") as caught:
+        load(nested(LIMITS.yaml_depth + 1))
+    assert caught.value.problems[0].line is not None
+
+
+def test_an_alias_bomb_is_refused_before_it_unfolds() -> None:
+    names = "abcdefghij"
+    flow = "a: &a [" + ", ".join(["lol"] * 9) + "]\n"
+    block = "a: &a\n" + "- lol\n" * 9
+    for before, name in pairwise(names):
+        flow += f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n"
+        block += f"{name}: &{name}\n" + f"- *{before}\n" * 9
+    for bomb in (flow, block):
+        with pytest.raises(TooLarge, match="unfold"):
+            load(bomb)
+
+
+def test_a_long_text_repeated_by_aliases_is_refused() -> None:
+    for said in (f"a: &a {'x' * 100_000}\nb:\n", f"a: &a\n- {'x' * 100_000}\nb:\n"):
+        with pytest.raises(TooLarge, match="unfold"):
+            load(said + "- *a\n" * 1000)
+
+
+@pytest.mark.parametrize(
+    "filling", [" ", "a", "a ", "'", "''", '"', "- ", "-", "[]", "a: ", "a:", "#", "~", "1", "é", "\\", "&a "]
+)
+@pytest.mark.parametrize("start", ["", "a: ", "- ", "a: '", 'a: "'])
+def test_long_lines_take_time_in_proportion(start: str, filling: str) -> None:
+    said = start + filling * (200_000 // len(filling)) + "@"
+    began = time.perf_counter()
+    with suppress(BadUpload):
+        load(said)
+    assert time.perf_counter() - began < 1
+
+
+def test_limits_on_nodes_and_bytes() -> None:
+    with pytest.raises(TooLarge, match="nodes") as caught:
+        _yaml.load(b"a:\n" + b"- 1\n" * 100, Limits(yaml_nodes=50))
+    assert caught.value.problems[0].line == 49  # a mapping, its key, a list and 48 items
+    with pytest.raises(TooLarge, match="bytes"):
+        _yaml.load(b"a: 1\n" * 100, Limits(text_bytes=50))
+
+
+def quick(said: str) -> Any:
+    """What the quick way makes of it, or a mark that it leaves it to the reference."""
+    try:
+        return _yaml._load_lines(said, LIMITS)
+    except _yaml._NotSimpleError:
+        return NotImplemented
+
+
+def test_both_ways_agree_on_all_real_files(shared: Path) -> None:
+    found = [p for end in ("*.yaml", "*.tmap2", "*.tmap", ".*.tmap2") for p in (shared / "data").rglob(end)]
+    assert len(found) > 50
+    simple = set()
+    for path in found:
+        said = path.read_text()
+        if path.parts[-3] == "navgraph":
+            with pytest.raises(UnreadableFile, match="%TAG"):  # Fawkes' own tags
+                _yaml._load_events(said, LIMITS)
+            continue
+        reference = _yaml._load_events(said, LIMITS)
+        assert reference == yaml.load(said, yaml.CSafeLoader) or "graphs" in said, path
+        value = quick(said)
+        if value is not NotImplemented:
+            simple.add(path.name)
+            assert value == reference, path
+            assert orjson.dumps(value) == orjson.dumps(reference), path  # also 1 and 1.0, True and 1
+    assert {
+        "network.tmap2.yaml",
+        "network_autogen.tmap2.yaml",
+        "poi.tmap2.yaml",
+        "tmap.tmap",
+        ".network.tmap2",
+    } <= simple
+
+
+WORDS = [
+    "a", "b c", "1", "1.5", "-0.25", "- 1", "-", "--- ", "...", "x:", "y: 1", "k: &n", "*n", "&n", "&n 1", "[]", "{}",
+    "[1, 2]", "'q'", "'it''s'", "'a: b'", '"d"', '"e\\n"', "yes", "~", "null", "08", "1e-05", "7e12", ".5", "# c",
+    "a # c", "a#c", "é: ü", "a : b", "'k': v", "? x", ": y", "| ", "> ", "!!str 1", "<<: a", "k: a: b", "http://x",
+    "12:30", "k: 'x' y", "a\u2028b", "\u00a0", "k:  2 ", "a,b", "$n.p", "(x)", "-x", "+1", ".nan", "@", "`", "%",
+    "a\tb",
+]  # fmt: skip
+line = st.tuples(
+    st.integers(0, 6), st.sampled_from(["", "", "- ", "-  ", "- - "]), st.lists(st.sampled_from(WORDS), max_size=2),
+    st.sampled_from(["", ": ", ":", " "]),
+)  # fmt: skip
+
+
+@settings(max_examples=1500, deadline=None)
+@given(st.lists(line, max_size=9), st.sampled_from(["\n", "\n", "\r\n"]))
+@example([(0, "", ["k: &n"], ""), (0, "- ", ["a"], ""), (0, "", ["b"], ": "), (0, "- ", ["*n"], "")], "\n")
+@example([(0, "", ["a", "1"], ": "), (2, "", ["b c"], "")], "\n")
+def test_both_ways_agree_on_whatever_the_quick_way_takes(rows: list[Any], end: str) -> None:
+    said = end.join(" " * indent + dash + glue.join(words) for indent, dash, words, glue in rows)
+    value = quick(said)
+    if value is not NotImplemented:
+        assert orjson.dumps(value) == orjson.dumps(_yaml._load_events(said, LIMITS)), said
+
+
+@settings(max_examples=500, deadline=None)
+@given(st.text("ab1.-: \n'\"#[]{}&*!|>~é", max_size=60))
+def test_both_ways_agree_on_any_text(said: str) -> None:
+    value = quick(said)
+    if value is not NotImplemented:
+        assert orjson.dumps(value) == orjson.dumps(_yaml._load_events(said, LIMITS)), said
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=200))
+def test_any_bytes_are_read_or_refused(data: bytes) -> None:
+    try:
+        value = load(data)
+    except BadUpload:
+        return
+    orjson.dumps(value)
+
+
+texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=12) | st.sampled_from(
+    [
+        "no", "y", "Null", "~", "1", "010", "1e5", "a: b", "- a", "#x", " a", "a ", "", "!x", "&x", "*x", "%x", "'",
+        '"', "\n", "a\nb", "<<", "=", "2022-01-01", "\u2028", "\ufeff", "\x85", "1_0", "0x1F", "[a", "{a", "é",
+        "x" * 1100, "a #b", "a:", ".nan", "-", "---", "...", "?", "k" * 250, "robot | tall", "$node.pose", "a/b.c",
+        "(x)", "a - b",
+    ]
+)  # fmt: skip
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**63 - 1)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | texts,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(texts, inner, max_size=4),
+    max_leaves=15,
+)
+
+
+@settings(max_examples=500, deadline=None)
+@given(st.dictionaries(texts, values, min_size=1, max_size=5))
+def test_what_is_written_is_read_back_by_us_and_by_pyyaml(value: dict[str, Any]) -> None:
+    said = _yaml.mapping(value, 0)
+    assert orjson.dumps(load(said), option=orjson.OPT_SORT_KEYS) == orjson.dumps(value, option=orjson.OPT_SORT_KEYS)
+    assert yaml.safe_load(said) == value
+    assert _yaml.mapping(dict(reversed(value.items())), 0) == said
+
+
+@settings(max_examples=600, deadline=None)
+@given(st.dictionaries(texts, values, min_size=1, max_size=5), st.randoms(use_true_random=False))
+def test_both_ways_agree_on_damaged_documents(value: dict[str, Any], random: Any) -> None:
+    lines = _yaml.mapping(value, 0).split("\n")
+    for _ in range(random.randrange(4)):
+        k = random.randrange(len(lines))
+        change = random.randrange(6)
+        if change == 0:
+            del lines[k]
+        elif change == 1:
+            lines.insert(k, random.choice(lines or [""]))
+        elif change == 2:
+            lines[k] = " " * random.randrange(1, 4) + lines[k]
+        elif change == 3:
+            lines[k] = lines[k][random.randrange(1, 4) :]
+        elif change == 4:
+            lines[k] += random.choice([" ", " # c", ":", " x", " *a", " &a", " []"])
+        else:
+            lines.insert(k, random.choice(["", "  ", "# c", "   # c: d", "a: &a", "- *a", "  b: *a"]))
+        lines = lines or [""]
+    said = "\n".join(lines)
+    taken = quick(said)
+    if taken is not NotImplemented:
+        assert orjson.dumps(taken) == orjson.dumps(_yaml._load_events(said, LIMITS)), said
+
+
+plain = st.text(st.characters(categories=["L", "N", "P", "Zs"], max_codepoint=0x2000), max_size=12).filter(
+    # rapidyaml's JSON writes these as .inf and .nan even where YAML has them in quotes.
+    lambda said: said.lower().lstrip("+-.") not in ("inf", "infinity", "nan")
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.dictionaries(plain, plain | st.booleans() | st.integers(-1000, 1000) | st.lists(plain, max_size=3), min_size=1)
+)
+def test_what_is_written_is_the_same_for_a_reader_of_yaml_1_2(value: dict[str, Any]) -> None:
+    tree = ryml.parse_in_arena(_yaml.mapping(value, 0).encode())
+    assert orjson.loads(ryml.emit_json(tree)) == value
