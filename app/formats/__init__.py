@@ -57,7 +57,9 @@ class ReadContext:
     frame: the environment's, where it has a datum. level: where the map belongs. grid: the name for a grid, else None.
     layer: what the lines and polygons of a drawing are meant for, else None. options: the format's own read options.
     wanted: the layers that will be used (None: all); a reader may leave others out. cells: whether anybody will look at
-    the cells of grids; if not, a reader checks an image's header only. main: the file that was detected.
+    the cells of grids; if not, a reader checks an image's header only. whole: whether anybody will ask for this format
+    (or its family) back; if not, a reader may leave out what only it knows (``properties.<format>``, the document).
+    main: the file that was detected.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -68,6 +70,7 @@ class ReadContext:
     options: Any = None
     wanted: frozenset[Layer] | None = None
     cells: bool = True
+    whole: bool = True
     main: str = ""
     warnings: list[Problem] = field(default_factory=list)
 
@@ -136,10 +139,10 @@ class Format:
     carries: layers it can hold. needs: what writing takes. detect: is this file (name, content) the main file of such
     a map; sure formats first (``rank``). companions: further files of the upload that belong to a main file.
     family: format family of its objects (``osm``, ``kml`` …). drawing: its lines and polygons may be meant for any
-    layer (the upload's ``layer`` says which). rank: of two files that tell the same network, the higher one wins. version:
-    raise it when the same layers give other bytes (it is part of every ETag). choose: of the parts that it carries,
-    those that these options ask for. by_file: the options that a wanted file's name says. outlines: it writes where
-    grids lie, not their cells.
+    layer (the upload's ``layer`` says which). rank: of two files that tell the same network, the higher one wins.
+    version: raise it when the same layers give other bytes (it is part of every ETag). choose: of the parts that it
+    carries, those that these options ask for. by_file: the options that a wanted file's name says. outlines: it writes
+    where grids lie, not their cells.
     """
 
     name: str

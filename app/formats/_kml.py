@@ -75,7 +75,12 @@ SLOT = re.compile(r"<\?(c|n|d ([^?]*))\?>")
 
 # Marks that stand for slots while libxml2 holds the tree: four C1 controls in a row, which no text has, not even UTF-8
 # misread as Latin-1 (and such characters keep a Python text at one byte a character). A file that has them is refused.
-_M_ITEM, _M_COORDINATES, _M_NAME, _M_DATA, _M_END = ("\x91\x9c\x82" + chr(0x86 + k) for k in range(5))
+_MARK = "\x91\x9c\x82"
+_M_ITEM, _M_COORDINATES, _M_NAME, _M_OPEN, _M_CLOSE, _M_END = (_MARK + chr(0x86 + k) for k in range(6))
+_SLOTS = {
+    m[-1]: s
+    for m, s in ((_M_COORDINATES, COORDINATES), (_M_NAME, NAME), (_M_OPEN, "<?d "), (_M_CLOSE, "?>"), (_M_END, END))
+}
 
 _BLANK, _CUT, _COMMA, _DIGIT, _OTHER = range(5)
 _CLASSES = bytearray([_OTHER] * 256)
@@ -512,7 +517,7 @@ class _Reader:
                 theirs.append(item)
         self._take(mine, parsed)
         whole = self._remove_ours(root, ours)
-        if theirs or not whole:
+        if (theirs or not whole) and self.context.wants("objects"):
             self._keep(root, theirs, parsed, name, entry, level)
 
     # --- our own words ---
@@ -681,53 +686,24 @@ class _Reader:
         ids, titles = _identify(items, self.context)
         properties: list[dict[str, Any]] = []
         types = shapely.get_type_id(geometry).tolist()
-        coordinates, names, values = 0, 0, 0
         for k, item in enumerate(items):
-            element = item.element
             title = titles[k]
-            own: dict[str, Any] = {
-                "kind": "overlay" if local_name(element) in OVERLAYS else _KINDS[types[k]] or _mixed(geometry[k])
-            }
+            kind = "overlay" if local_name(item.element) in OVERLAYS else _KINDS[types[k]] or _mixed(geometry[k])
+            own: dict[str, Any] = {"kind": kind}
             kept: dict[str, Any] = {"document": name, "place": k}
-            if title is not None:
-                tag, text = title
-                if text:
-                    own["name"] = text
-                tag.text = _M_NAME
-                names += 1
+            if title is not None and title[1]:
+                own["name"] = title[1]
             for label, value in item.data:
                 aside = label in RESERVED
                 (kept.setdefault("data", {}) if aside else own)[label] = value.text or ""
-                value.text = f"{_M_DATA}{quote(label)}{_M_DATA}"
-                values += 1
-            if item.shape:
-                kept["shape"] = item.shape
-                for _, _, c in item.sequences:
-                    c.text = _M_COORDINATES
-                coordinates += len(item.sequences)
-            own["kml"] = kept
+            own[FAMILY] = kept
             properties.append(own)
-        text, begins = _serialised(root, [item.element for item in items])
-        found = [text.count(m) for m in (_M_NAME, _M_DATA, _M_COORDINATES)]
-        runs = text.count(_M_ITEM) - len(items)
-        if found != [names, 2 * values, coordinates] or runs != sum(begins) or text.count(_M_END) > 1:
-            reason = "the file has runs of control characters (U+0091 U+009C U+0082 …) that serve as marks here"
-            raise UnreadableFile(reason, [Problem(reason)])
-        text = text.replace(_M_NAME, NAME).replace(_M_COORDINATES, COORDINATES).replace(_M_END, END)
-        if values:
-            text = re.sub(f"{_M_DATA}([^\x91]*){_M_DATA}", r"<?d \1?>", text)
-        pieces = iter(text.split(_M_ITEM))
-        skeleton = []
-        for k, (own, first) in enumerate(zip(properties, begins, strict=True)):
-            if first:
-                skeleton += [next(pieces), f"<?items {k}?>"]
-            own[FAMILY]["xml"] = next(pieces)
-        skeleton += pieces
-        document: dict[str, Any] = {"xml": "".join(skeleton)}
-        if entry is not None:
-            document["entry"] = entry
-        self.documents.setdefault(level, {})[name] = document
         self.columns.setdefault(level, []).append((ids, list(geometry), properties))
+        documents = self.documents.setdefault(level, {})
+        if self.context.whole:
+            documents[name] = {"xml": _keep_text(root, items, [t[0] if t else None for t in titles], properties)}
+            if entry is not None:
+                documents[name]["entry"] = entry
 
     # --- the result ---
 
@@ -739,7 +715,7 @@ class _Reader:
             geometry = np.empty(len(shapes), object)
             geometry[:] = shapes
             properties = [p for c in columns for p in c[2]]
-            document = {FAMILY: {"documents": self.documents[level]}}
+            document = {FAMILY: {"documents": self.documents[level]}} if self.documents[level] else {}
             key = PartKey("objects", level, FAMILY)
             parts[key] = Features(tuple(ids), geometry, tuple(properties), np.zeros(len(ids), bool), document)
         for key, own in self.own.items():
@@ -866,7 +842,10 @@ def _values(extended: etree._Element) -> list[tuple[str, etree._Element]]:
     out: dict[str, etree._Element] = {}
     for entry in extended.iter("{*}Data", "{*}SimpleData"):
         name = entry.get("name")
-        value = child(entry, "value") if local_name(entry) == "Data" else entry
+        if local_name(entry) == "SimpleData":
+            value = entry
+        else:
+            value = entry[0] if len(entry) == 1 and local_name(entry[0]) == "value" else child(entry, "value")
         if name and value is not None and not len(value) and name not in out:
             out[name] = value
     return list(out.items())
@@ -1010,6 +989,59 @@ def _identify(
         others = f" and {len(again) - 1} more" if len(again) > 1 else ""
         context.warn(f"several placemarks are called {again[0]!r}{others}; all are kept", where=again[0][:200])
     return ids, titles
+
+
+def _keep_text(
+    root: etree._Element,
+    items: Sequence[_Item],
+    titles: Sequence[etree._Element | None],
+    properties: Sequence[dict[str, Any]],
+) -> str:
+    """Put each item's element as text, with slots, into its properties; the rest of the document is the answer."""
+    names = values = coordinates = 0
+    for item, title, own in zip(items, titles, properties, strict=True):
+        if title is not None:
+            title.text = _M_NAME
+            names += 1
+        for label, value in item.data:
+            value.text = f"{_M_OPEN}{quote(label)}{_M_CLOSE}"
+            values += 1
+        if item.shape:
+            own[FAMILY]["shape"] = item.shape
+            for _, _, c in item.sequences:
+                c.text = _M_COORDINATES
+            coordinates += len(item.sequences)
+    text, begins = _serialised(root, [item.element for item in items])
+    pieces, counts = _slotted(text)
+    marks = (_M_ITEM, _M_NAME, _M_COORDINATES, _M_OPEN, _M_CLOSE)
+    expected = [len(items) + sum(begins), names, coordinates, values, values]
+    if [counts.pop(m[-1], 0) for m in marks] != expected or counts.pop(_M_END[-1], 0) > 1 or counts:
+        reason = "the file has runs of control characters (U+0091 U+009C U+0082 …) that serve as marks here"
+        raise UnreadableFile(reason, [Problem(reason)])
+    skeleton = []
+    for k, (own, first) in enumerate(zip(properties, begins, strict=True)):
+        if first:
+            skeleton += [next(pieces), f"<?items {k}?>"]
+        own[FAMILY]["xml"] = next(pieces)
+    return "".join([*skeleton, *pieces])
+
+
+def _slotted(text: str) -> tuple[Iterator[str], Counter[str]]:
+    """The text cut at its item marks, with slots for its other marks, and how many there are of each."""
+    first, *chunks = text.split(_MARK)
+    pieces: list[str] = []
+    current = [first]
+    counts = Counter(c[:1] for c in chunks)
+    item = _M_ITEM[-1]
+    for chunk in chunks:
+        code = chunk[:1]
+        if code == item:
+            pieces.append("".join(current))
+            current = [chunk[1:]]
+        else:
+            current += (_SLOTS.get(code, ""), chunk[1:])
+    pieces.append("".join(current))
+    return iter(pieces), counts
 
 
 def _serialised(root: etree._Element, items: Sequence[etree._Element]) -> tuple[str, list[bool]]:

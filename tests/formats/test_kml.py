@@ -355,6 +355,17 @@ def test_placemarks_of_the_oldest_form_are_kept_with_a_warning(real, same):
     assert save(layers).count(b"foo ") == 2
 
 
+def test_what_only_kml_knows_can_be_left_out():
+    data = (SAMPLES / "orchard.kml").read_bytes()
+    whole, short = objects(load(data)[0]), objects(load(data, whole=False)[0])
+    assert short.ids == whole.ids
+    assert all(a.equals(b) for a, b in zip(short.geometry, whole.geometry, strict=True))
+    assert [{**p, "kml": 0} for p in short.properties] == [{**p, "kml": 0} for p in whole.properties]
+    assert short.properties[1]["kml"]["data"] == {"kind": "apple"}
+    assert short.document == {}
+    assert sorted(objects(load(save(Layers({OBJECTS: short})))[0]).ids) == sorted(whole.ids)
+
+
 def test_documents_are_merged_by_key_at_every_depth():
     a = {"kml": {"documents": {"a": {"xml": "1"}}, "x": 1}, "only": [1]}
     b = {"kml": {"documents": {"b": {"xml": "2"}}, "x": {"y": 2}}}
