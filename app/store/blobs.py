@@ -1,35 +1,429 @@
-"""Content-addressed files."""
+"""Content-addressed files: uploads byte for byte, and the files that maps consist of.
+
+A blob lies in ``ab/abcdef…`` (its SHA-256), or with many other small ones in ``packs/<SHA-256 of the pack>``; the table
+``blob`` says which. What is written gets a temporary name, is synced, renamed, and its folder synced, before anything
+refers to it. The table's row comes first when a blob is used again, so that a collection in progress leaves it alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import io
+import os
+import re
+import secrets
+import shutil
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final
+
+from sqlalchemy import Connection, bindparam, delete, select, update
+from sqlalchemy.dialects import postgresql, sqlite
+
+from app.errors import Damaged, Invalid, NotFound, Unavailable
+from app.store.database import Database
+from app.store.tables import blob
+
+PACKED_BELOW: Final = 64 * 2**10
+"""Smaller files of one upload share a pack."""
+
+PACK_BYTES: Final = 64 * 2**20
+BLOCK: Final = 2**20
+BATCH: Final = 500
+_NAME = re.compile(r"[0-9a-f]{64}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    size: int
+    pack: str | None
+    start: int
 
 
 class Blobs:
-    """Bytes by their SHA-256 (hex)."""
+    """Bytes by their SHA-256 (hex). Thread-safe, and safe beside other processes on the same folder and database."""
+
+    def __init__(self, database: Database, folder: Path, *, readonly: bool = False) -> None:
+        self._database = database
+        self.folder = folder
+        self._readonly = readonly
+
+    def prepare(self) -> None:
+        """Make the folders."""
+        for path in (self.folder, self._packs, self._temporary):
+            path.mkdir(parents=True, exist_ok=True)
+
+    @property
+    def _packs(self) -> Path:
+        return self.folder / "packs"
+
+    @property
+    def _temporary(self) -> Path:
+        return self.folder / "tmp"
+
+    def _path(self, sha256: str) -> Path:
+        return self.folder / sha256[:2] / sha256
+
+    # --- writing ---
 
     def put(self, data: bytes | Path) -> str:
         """Store bytes or a file's content durably; the SHA-256."""
-        raise NotImplementedError
+        return self.put_many([data])[0]
 
     def put_many(self, files: Sequence[bytes | Path]) -> list[str]:
-        """Store several files with one set of fsyncs; their SHA-256s in the same order."""
-        raise NotImplementedError
+        """Store several files with one set of fsyncs; their SHA-256s in the same order.
+
+        Small ones (below 64 KiB) go into one pack. Nothing is written twice. Unavailable where the disk refuses.
+        """
+        if self._readonly:
+            raise Invalid("this store was opened for reading only")
+        try:
+            return self._put_many(files)
+        except OSError as error:
+            raise Unavailable(
+                f"the blob folder cannot be written: {error.strerror or error}. Try again later"
+            ) from error
+
+    def _put_many(self, files: Sequence[bytes | Path]) -> list[str]:
+        names: list[str] = []
+        small: dict[str, bytes] = {}
+        large: dict[str, bytes | Path] = {}
+        sizes: dict[str, int] = {}
+        for data in files:
+            size = len(data) if isinstance(data, bytes) else data.stat().st_size
+            if size < PACKED_BELOW and len(files) > 1:
+                content = data if isinstance(data, bytes) else data.read_bytes()
+                name = hashlib.sha256(content).hexdigest()
+                small[name] = content
+            else:
+                name = hashlib.sha256(data).hexdigest() if isinstance(data, bytes) else _hash_file(data)
+                large[name] = data
+            sizes[name] = size
+            names.append(name)
+        known = self._touch(sizes)
+        lost = {n for n in sizes if not self._present(n, known.get(n))}
+        self._write_large({n: d for n, d in large.items() if n in lost})
+        rows: list[dict[str, object]] = [
+            {"sha256": n, "size": sizes[n], "pack": None, "start": 0} for n in large if n in lost
+        ]
+        rows += self._write_packs({n: d for n, d in small.items() if n in lost})
+        if rows:
+            with self._database.write() as connection:
+                _upsert(connection, [r for r in rows if r["sha256"] not in known])
+                # A row whose file was lost: the content is back, at a new place.
+                _relocate(
+                    connection,
+                    [{"name": r["sha256"], "to": r["pack"], "at": r["start"]} for r in rows if r["sha256"] in known],
+                )
+        return names
+
+    def _touch(self, sizes: Mapping[str, int]) -> dict[str, _Row]:
+        """Rows that exist, marked as used now: from here on a collection leaves them alone."""
+        names = sorted(sizes)
+        out: dict[str, _Row] = {}
+        with self._database.read() as connection:
+            if not self._rows(connection, names):
+                return out
+        with self._database.write() as connection:
+            for start in range(0, len(names), BATCH):
+                some = names[start : start + BATCH]
+                connection.execute(update(blob).where(blob.c.sha256.in_(some)).values(used=int(time.time())))
+                out.update(self._rows(connection, some))
+        return out
+
+    def _present(self, name: str, row: _Row | None) -> bool:
+        if row is None:
+            return False
+        path = self._path(name) if row.pack is None else self._packs / row.pack
+        try:
+            return path.stat().st_size >= row.start + row.size
+        except OSError:
+            return False
+
+    def _write_large(self, files: Mapping[str, bytes | Path]) -> None:
+        written: list[tuple[Path, Path]] = []
+        folders: set[Path] = set()
+        try:
+            for name, data in files.items():
+                temporary = self._temporary / secrets.token_hex(16)
+                written.append((temporary, self._path(name)))
+                with temporary.open("wb") as out:
+                    if isinstance(data, bytes):
+                        out.write(data)
+                    else:
+                        with data.open("rb") as source:
+                            shutil.copyfileobj(source, out, BLOCK)
+                    out.flush()
+                    os.fsync(out.fileno())
+                if not isinstance(data, bytes) and _hash_file(temporary) != name:
+                    raise OSError(f"{data.name} changed while it was stored")
+            for temporary, path in written:
+                if not path.parent.is_dir():
+                    path.parent.mkdir(exist_ok=True)
+                    folders.add(self.folder)
+                temporary.replace(path)
+                folders.add(path.parent)
+        except BaseException:
+            for temporary, _ in written:
+                temporary.unlink(missing_ok=True)
+            raise
+        for folder in folders:
+            _sync_folder(folder)
+
+    def _write_packs(self, files: Mapping[str, bytes]) -> list[dict[str, object]]:
+        """Packs of at most 64 MiB; the rows that say where each file is in them."""
+        rows: list[dict[str, object]] = []
+        group: list[str] = []
+        size = 0
+        for name in files:
+            group.append(name)
+            size += len(files[name])
+            if size >= PACK_BYTES:
+                rows += self._write_pack({n: files[n] for n in group})
+                group, size = [], 0
+        if group:
+            rows += self._write_pack({n: files[n] for n in group})
+        return rows
+
+    def _write_pack(self, files: Mapping[str, bytes]) -> list[dict[str, object]]:
+        whole = b"".join(files.values())
+        # Two packs with the same content in another order of names are two files: no row ever changes its meaning.
+        pack = hashlib.sha256(whole + secrets.token_bytes(16)).hexdigest()
+        temporary = self._temporary / secrets.token_hex(16)
+        try:
+            with temporary.open("wb") as out:
+                out.write(whole)
+                out.flush()
+                os.fsync(out.fileno())
+            temporary.replace(self._packs / pack)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        _sync_folder(self._packs)
+        rows: list[dict[str, object]] = []
+        start = 0
+        for name, data in files.items():
+            rows.append({"sha256": name, "size": len(data), "pack": pack, "start": start})
+            start += len(data)
+        return rows
+
+    # --- reading ---
 
     def get(self, sha256: str) -> bytes:
-        """The content, hashed again; Damaged where it does not match, NotFound where there is none."""
-        raise NotImplementedError
+        """The content, hashed again; Damaged where it does not match or is lost, NotFound where it never was."""
+        return self.get_many([sha256])[sha256]
+
+    def get_many(self, hashes: Sequence[str]) -> dict[str, bytes]:
+        """SHA-256 -> content, all hashed again."""
+        wanted = list(dict.fromkeys(hashes))
+        with self._database.read() as connection:
+            rows = self._rows(connection, wanted)
+        out: dict[str, bytes] = {}
+        for name in wanted:
+            if name not in rows:
+                raise NotFound(f"there is no stored file {name}")
+            data = self._read(name, rows[name])
+            if data is None:  # it was moved to another pack between the query and the read
+                data = self._read(name, self._row(name))
+            if data is None:
+                raise Damaged(f"the stored file {name} is lost: restore it from a backup")
+            if hashlib.sha256(data).hexdigest() != name:
+                raise Damaged(f"the stored file {name} does not match its hash: restore it from a backup")
+            out[name] = data
+        return out
+
+    def _read(self, name: str, row: _Row) -> bytes | None:
+        try:
+            if row.pack is None:
+                return self._path(name).read_bytes()
+            with (self._packs / row.pack).open("rb") as source:
+                source.seek(row.start)
+                return source.read(row.size)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise Unavailable(f"the blob folder cannot be read: {error.strerror or error}. Try again later") from error
 
     def open(self, sha256: str) -> BinaryIO:
-        """The content as a seekable file, hashed again."""
-        raise NotImplementedError
+        """The content as a seekable file, hashed again before it is handed out; for big ones that are read in parts."""
+        row = self._row(sha256)
+        if row.pack is not None:
+            return io.BytesIO(self.get(sha256))
+        try:
+            file = self._path(sha256).open("rb")
+        except OSError as error:
+            raise Damaged(f"the stored file {sha256} is lost: restore it from a backup") from error
+        if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
+            file.close()
+            raise Damaged(f"the stored file {sha256} does not match its hash: restore it from a backup")
+        file.seek(0)
+        return file
 
     def path(self, sha256: str) -> Path | None:
-        """The file with exactly this content, None where it is packed with others."""
-        raise NotImplementedError
+        """The file with exactly this content, None where it is packed with others. Its bytes are not checked here."""
+        return None if self._row(sha256).pack is not None else self._path(sha256)
 
     def size(self, sha256: str) -> int:
         """Bytes of the content."""
-        raise NotImplementedError
+        return self._row(sha256).size
+
+    def _row(self, name: str) -> _Row:
+        with self._database.read() as connection:
+            row = self._rows(connection, [name]).get(name)
+        if row is None:
+            raise NotFound(f"there is no stored file {name}")
+        return row
+
+    @staticmethod
+    def _rows(connection: Connection, names: Sequence[str]) -> dict[str, _Row]:
+        out: dict[str, _Row] = {}
+        for start in range(0, len(names), BATCH):
+            some = list(names[start : start + BATCH])
+            query = select(blob.c.sha256, blob.c.size, blob.c.pack, blob.c.start).where(blob.c.sha256.in_(some))
+            out.update((r.sha256, _Row(r.size, r.pack, r.start)) for r in connection.execute(query))
+        return out
+
+    # --- upkeep ---
+
+    def check(self) -> None:
+        """Unavailable unless the folder can be written."""
+        try:
+            self.prepare()
+            probe = self._temporary / f"probe-{secrets.token_hex(8)}"
+            probe.write_bytes(b"")
+            probe.unlink()
+        except OSError as error:
+            raise Unavailable(f"the blob folder cannot be written: {error.strerror or error}") from error
+
+    def recover(self, older_than: float) -> int:
+        """Remove temporary files of killed uploads, and packs that no row knows, if older (seconds); how many."""
+        self.prepare()
+        limit = time.time() - older_than
+        count = 0
+        for path in self._temporary.iterdir():
+            count += _unlink_if_older(path, limit)
+        with self._database.read() as connection:
+            known = set(connection.execute(select(blob.c.pack).where(blob.c.pack.is_not(None)).distinct()).scalars())
+        for path in self._packs.iterdir():
+            if path.name not in known:
+                count += _unlink_if_older(path, limit)
+        return count
+
+    def collect(self, referenced: set[str], before: int) -> tuple[int, int]:
+        """Remove blobs that nobody refers to and that were last used before this second: (how many, bytes).
+
+        Files go while the transaction still holds their rows, so that an upload that uses one again waits, and then
+        finds it gone and writes it.
+        """
+        with self._database.read() as connection:
+            query = select(blob.c.sha256, blob.c.size).where(blob.c.used < before)
+            idle = {name: size for name, size in connection.execute(query) if name not in referenced}
+        names = sorted(idle)
+        count = freed = 0
+        packs: set[str] = set()
+        for start in range(0, len(names), BATCH):
+            some = names[start : start + BATCH]
+            with self._database.write() as connection:
+                gone = connection.execute(
+                    delete(blob)
+                    .where(blob.c.sha256.in_(some), blob.c.used < before)
+                    .returning(blob.c.sha256, blob.c.size, blob.c.pack)
+                ).all()
+                for row in gone:
+                    count += 1
+                    freed += row.size
+                    if row.pack is None:
+                        self._path(row.sha256).unlink(missing_ok=True)
+                    else:
+                        packs.add(row.pack)
+        for pack in sorted(packs):
+            self._repack(pack)
+        self._remove_strays(before)
+        return count, freed
+
+    def _repack(self, pack: str) -> None:
+        """Write what is still used of a pack into a new one."""
+        with self._database.read() as connection:
+            names = list(connection.execute(select(blob.c.sha256).where(blob.c.pack == pack)).scalars())
+        if names:
+            moved = self._write_pack(self.get_many(names))
+            with self._database.write() as connection:
+                _relocate(
+                    connection,
+                    [{"name": r["sha256"], "to": r["pack"], "at": r["start"], "pack_was": pack} for r in moved],
+                )
+        with self._database.write() as connection:
+            if connection.execute(select(blob.c.sha256).where(blob.c.pack == pack).limit(1)).first() is None:
+                (self._packs / pack).unlink(missing_ok=True)
+
+    def _remove_strays(self, before: int) -> None:
+        """Files that no row knows: what a crash between the file and its row left."""
+        for folder in self.folder.iterdir():
+            if len(folder.name) != 2 or not folder.is_dir():
+                continue
+            files = [path for path in folder.iterdir() if _NAME.fullmatch(path.name)]
+            with self._database.read() as connection:
+                known = self._rows(connection, [path.name for path in files])
+            for path in files:
+                if path.name not in known:
+                    _unlink_if_older(path, before)
+
+    def verify(self) -> list[str]:
+        """Hash everything; the names of what is damaged or lost."""
+        with self._database.read() as connection:
+            names = list(connection.execute(select(blob.c.sha256).order_by(blob.c.sha256)).scalars())
+        bad = []
+        for name in names:
+            try:
+                self.open(name).close()
+            except (Damaged, NotFound):
+                bad.append(name)
+        return bad
+
+
+def _upsert(connection: Connection, rows: Sequence[Mapping[str, object]]) -> None:
+    """Rows for new blobs; where another upload was quicker its row stays and counts as used now."""
+    if not rows:
+        return
+    now = int(time.time())
+    values = [{**row, "used": now} for row in sorted(rows, key=lambda r: str(r["sha256"]))]
+    make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
+    statement = make(blob)
+    connection.execute(
+        statement.on_conflict_do_update(index_elements=["sha256"], set_={"used": statement.excluded.used}), values
+    )
+
+
+def _relocate(connection: Connection, rows: Iterable[Mapping[str, object]]) -> None:
+    listed = list(rows)
+    if not listed:
+        return
+    statement = update(blob).where(blob.c.sha256 == bindparam("name"))
+    if "pack_was" in listed[0]:
+        statement = statement.where(blob.c.pack == bindparam("pack_was"))
+    connection.execute(statement.values(pack=bindparam("to"), start=bindparam("at")), listed)
+
+
+def _hash_file(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _unlink_if_older(path: Path, limit: float) -> int:
+    try:
+        if path.stat().st_mtime < limit:
+            path.unlink()
+            return 1
+    except FileNotFoundError:
+        pass
+    return 0

@@ -184,10 +184,10 @@ def cells(draft: Draft, a: PartRoot | None, b: PartRoot | None) -> CellChanges:
                     low = np.minimum(low, [columns.min() + change.column, rows.min() + change.row])
                     high = np.maximum(high, [columns.max() + change.column + 1, rows.max() + change.row + 1])
             if math.isfinite(low[0]):
-                out.box = _cell_box(b.header, *low.tolist(), *high.tolist())
+                out.box = cell_box(b.header, *low.tolist(), *high.tolist())
             return out
         if _offset(a.header, b.header) is None:
-            out.box = _cell_box(b.header, 0, 0, b.header["width"], b.header["height"])
+            out.box = cell_box(b.header, 0, 0, b.header["width"], b.header["height"])
             return out
     return _laid_over(draft, a, b, out)
 
@@ -217,7 +217,7 @@ def _laid_over(draft: Draft, a: PartRoot | None, b: PartRoot | None, out: CellCh
             low = np.minimum(low, [columns.min() + c0, rows.min() + start])
             high = np.maximum(high, [columns.max() + c0 + 1, rows.max() + start + 1])
     if math.isfinite(low[0]):
-        out.box = _cell_box(header, *low.tolist(), *high.tolist())
+        out.box = cell_box(header, *low.tolist(), *high.tolist())
     return out
 
 
@@ -251,7 +251,7 @@ def _offset(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[int, int] | Non
     return round(row), round(column)
 
 
-def _cell_box(header: Mapping[str, Any], x0: float, y0: float, x1: float, y1: float) -> Box:
+def cell_box(header: Mapping[str, Any], x0: float, y0: float, x1: float, y1: float) -> Box:
     """The box in metres around cells [x0, x1) × [y0, y1) of a grid."""
     x, y, yaw = header["origin"]
     r = header["resolution"]

@@ -897,15 +897,39 @@ def _load_resources(draft: Draft, root: PartRoot, fetch: FetchBlobs) -> Resource
     return Resources({path: contents[h] for path, _, h in rows})
 
 
-def all_chunks(draft: Draft, name: bytes) -> tuple[set[bytes], set[str]]:
-    """Everything a part refers to: hashes of its chunks, and of its blobs (hex)."""
+def all_chunks(draft: Draft, name: bytes, known: Container[bytes]) -> tuple[set[bytes], set[str]]:
+    """Everything a part refers to, but what is below known nodes: hashes of its chunks, and of its blobs (hex)."""
     root = read_root(draft, name)
     out = {name, *_document_chunks(root)}
     blobs: set[str] = set()
     for node in root.trees.values():
-        out |= tree.names(draft, node)
+        out |= tree.names(draft, node, known)
     if root.type in ("grid", "picture"):
         out |= _tile_names(draft, root)
     elif root.type == "resources":
         blobs = {h for _, _, h in resource_files(draft, root)}
     return out, blobs
+
+
+def new_chunks(draft: Draft, name: bytes, known: Container[bytes]) -> tuple[list[bytes], list[bytes]]:
+    """The draft's own chunks that a part needs: (nodes and documents, tiles). known: chunks that the base has."""
+    root = read_root(draft, name)
+    nodes = [h for h in (name, *_document_chunks(root)) if h in draft.new and not draft.was_read(h)]
+    tiles: list[bytes] = []
+    todo = [node for node in root.trees.values() if node is not None]
+    raster = root.type in ("grid", "picture")
+    while todo:
+        node = todo.pop()
+        if node.hash not in draft.new or node.hash in known or draft.was_read(node.hash):
+            continue
+        nodes.append(node.hash)
+        if node.level:
+            todo.extend(draft.inner(node.hash).children())
+        elif raster:
+            tiles.extend(t for _, t in tile_leaf(draft.new[node.hash]) if t in draft.stored)
+    return nodes, tiles
+
+
+def coordinates(geometry: Any) -> NDArray[np.float64]:
+    """All (x, y) of one geometry: float64 [n, 2]."""
+    return np.asarray(shapely.get_coordinates(geometry), np.float64)

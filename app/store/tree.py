@@ -353,11 +353,12 @@ def differing(draft: Draft, a: Node | None, b: Node | None) -> tuple[list[bytes]
         )
 
 
-def names(draft: Draft, root: Node | None) -> set[bytes]:
-    """The hashes of all nodes of a tree; leaves are named by their parents and not read."""
+def names(draft: Draft, root: Node | None, known: Container[bytes] = ()) -> set[bytes]:
+    """The hashes of all nodes of a tree, but of known ones and what is below them. Leaves are not read."""
     out: set[bytes] = set()
     nodes = [root] if root else []
     while nodes:
+        nodes = [n for n in nodes if n.hash not in known]
         out.update(n.hash for n in nodes)
         inner = [n for n in nodes if n.level]
         draft.read_many([n.hash for n in inner])

@@ -1,0 +1,113 @@
+"""What all parts of the store share: where it is, rows as values, texts that both databases take."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+from sqlalchemy import Connection, Row, select
+
+from app.errors import Gone, Invalid, NotFound, Problem
+from app.model.frame import Datum
+from app.store import tables
+from app.store.blobs import Blobs
+from app.store.chunks import Chunks
+from app.store.database import Database
+from app.store.values import Environment
+
+ENVIRONMENT_NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
+RESERVED: Final = frozenset({"robots", "server"})
+CHANNEL_NAME: Final = re.compile(r"[a-z][a-z0-9_-]{0,62}")
+
+MAX_TEXT: Final = 64 * 2**10
+
+
+class Base:
+    """One database and one blob folder."""
+
+    database_url: str
+    blob_dir: Path
+    readonly: bool
+    blobs: Blobs
+    _database: Database
+    _chunks: Chunks
+
+
+def utcnow() -> datetime:
+    """The present, in UTC."""
+    return datetime.now(UTC)
+
+
+def text(value: str, what: str, longest: int = MAX_TEXT) -> str:
+    """A text that both databases can keep: no NUL, no lone surrogate, not too long; else Invalid."""
+    if len(value) > longest or "\x00" in value or any("\ud800" <= c <= "\udfff" for c in value):
+        raise Invalid(f"{what} must have at most {longest} characters, none of them NUL or half of a surrogate pair")
+    return value
+
+
+def clean(value: str) -> str:
+    """A text from a file's content, with what databases refuse replaced by U+FFFD."""
+    return value.replace("\x00", "\ufffd").encode("utf-8", "replace").decode()
+
+
+def clean_problem(problem: Problem) -> Problem:
+    """A problem whose texts can be kept."""
+    return Problem(
+        clean(problem.problem),
+        None if problem.file is None else clean(problem.file),
+        problem.line,
+        None if problem.where is None else clean(problem.where),
+    )
+
+
+def check_environment_name(name: str) -> str:
+    """Invalid unless the contract allows the name."""
+    if not ENVIRONMENT_NAME.fullmatch(name) or name in RESERVED:
+        raise Invalid(
+            f"an environment cannot be called {name[:80]!r}: use 1 to 63 of a-z, 0-9, _ and -, starting with a "
+            "letter or digit; 'robots' and 'server' are taken"
+        )
+    return name
+
+
+def environment_row(connection: Connection, name: str, *, lock: bool = False, deleted: bool = False) -> Row[Any]:
+    """The environment's row, locked until the transaction ends if asked; Gone where deleted, NotFound where unknown."""
+    query = select(tables.environment).where(tables.environment.c.name == name)
+    row = connection.execute(query.with_for_update() if lock else query).one_or_none()
+    if row is None:
+        raise NotFound(f"there is no environment {name[:80]!r}")
+    if row.deleted is not None and not deleted:
+        raise Gone(f"the environment {name!r} is deleted; POST /api/v1/environments/{name}/restore brings it back")
+    return row
+
+
+def datum_of(members: dict[str, float] | None) -> Datum | None:
+    """A stored datum."""
+    return None if members is None else Datum(**members)
+
+
+def as_environment(row: Row[Any]) -> Environment:
+    """A row as a value."""
+    return Environment(
+        id=row.id,
+        name=row.name,
+        title=row.title,
+        description=row.description,
+        tags=tuple(row.tags),
+        head=row.head,
+        root=row.root,
+        datum=datum_of(row.datum),
+        bounds=None if row.west is None else (row.west, row.south, row.east, row.north),
+        created=row.created,
+        updated=row.updated,
+        deleted=row.deleted,
+        sequence=row.sequence,
+    )
+
+
+def check_tags(tags: Sequence[str]) -> list[str]:
+    """Tags as they are kept: no repeats, in the order given."""
+    return [text(tag, "a tag", 256) for tag in dict.fromkeys(tags)]

@@ -1,0 +1,92 @@
+"""Garbage collection: mark what any version refers to, sweep what nothing used within the grace period.
+
+It never races an upload. What a version in progress relies on is either part of its base version, which exists while it
+is marked (else the commit fails), or it was written or used again within the grace period; rows are removed under a
+condition on that time, in the same statement that finds them.
+"""
+
+from __future__ import annotations
+
+import time
+from datetime import timedelta
+from typing import Final
+
+from sqlalchemy import delete, select
+
+from app.store import chunks, parts, tables
+from app.store.base import Base, utcnow
+from app.store.manifest import unpack_manifest
+from app.store.tree import Draft
+
+IDEMPOTENCY_DAYS: Final = 7
+EVENT_DAYS: Final = 30
+JOB_DAYS: Final = 7
+PAGE: Final = 500
+
+
+class Collection(Base):
+    """Upkeep."""
+
+    def collect(self, grace: timedelta) -> dict[str, int]:
+        """Remove chunks and blobs that no version refers to and that were not written or used within ``grace``.
+
+        ``{chunks, blobs, bytes, temporary}``: how many went, bytes of the blobs. Old idempotency keys (7 days),
+        finished jobs (7 days) and events of purged environments (30 days) go too. ``grace`` must be longer than any
+        upload takes. Damaged where a version's chunk is: nothing is removed then. One process at a time should collect.
+        """
+        self._chunks.forget()
+        before = int(time.time() - grace.total_seconds()) + (1 if not grace else 0)
+        live_chunks, live_blobs = self._live()
+        removed = self._sweep(live_chunks, before)
+        blobs, size = self.blobs.collect(live_blobs, before)
+        temporary = self.blobs.recover(max(grace.total_seconds(), 0.0))
+        self._tidy()
+        return {"chunks": removed, "blobs": blobs, "bytes": size, "temporary": temporary}
+
+    def _live(self) -> tuple[set[bytes], set[str]]:
+        """Every chunk and blob that a version refers to. Equal parts of several versions are walked once."""
+        table = tables.version
+        hashes: dict[str, None] = {}
+        # One snapshot: a clone made and its origin purged while this runs would else be seen in neither place.
+        with self._database.snapshot() as connection:
+            rows = connection.execution_options(stream_results=True).execute(select(table.c.manifest))
+            for some in rows.partitions(PAGE):
+                for (manifest,) in some:
+                    hashes.update((entry.hash, None) for entry in unpack_manifest(bytes(manifest))[2])
+            blobs = set(connection.execute(select(tables.source.c.sha256).distinct()).scalars())
+        live: set[bytes] = set()
+        for name in hashes:
+            chunks_of, files = parts.all_chunks(Draft(self._chunks), bytes.fromhex(name), live)
+            live |= chunks_of
+            blobs |= files
+        return live, blobs
+
+    def _sweep(self, live: set[bytes], before: int) -> int:
+        table = tables.chunk
+        count = 0
+        last = b""
+        while True:
+            query = select(table.c.hash, table.c.used).where(table.c.hash > last).order_by(table.c.hash)
+            with self._database.read() as connection:
+                rows = connection.execute(query.limit(PAGE * 10)).all()
+            idle = [bytes(h) for h, used in rows if used < before and bytes(h) not in live]
+            if idle:
+                with self._database.write() as connection:
+                    count += chunks.delete(connection, idle, before)
+            if len(rows) < PAGE * 10:
+                return count
+            last = bytes(rows[-1].hash)
+
+    def _tidy(self) -> None:
+        now = utcnow()
+        known, keys, jobs = tables.event, tables.idempotency, tables.job
+        with self._database.write() as connection:
+            connection.execute(delete(keys).where(keys.c.time < now - timedelta(days=IDEMPOTENCY_DAYS)))
+            finished = jobs.c.state.in_(("done", "failed", "cancelled"))
+            connection.execute(delete(jobs).where(finished, jobs.c.updated < now - timedelta(days=JOB_DAYS)))
+            connection.execute(
+                delete(known).where(
+                    known.c.time < now - timedelta(days=EVENT_DAYS),
+                    known.c.environment_id.not_in(select(tables.environment.c.id)),
+                )
+            )

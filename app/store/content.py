@@ -1,0 +1,149 @@
+"""Content of versions: whole, by box, by id, and what differs between two."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+from app.errors import Invalid, NotFound
+from app.model.features import Features
+from app.model.frame import Anchor
+from app.model.geodesy import local_frame
+from app.model.layers import VECTOR_LAYERS, Layers, PartKey
+from app.store import difference, parts
+from app.store.base import Base
+from app.store.parts import PartRoot
+from app.store.prepare import differing_keys, frame_changes, part_names, roots_of
+from app.store.tree import Draft
+from app.store.values import Box, Delta, FeatureDelta, GridDelta, Version
+
+
+class Content(Base):
+    """Reading layers. Any version costs the same."""
+
+    def load(self, version: Version, keys: Collection[PartKey] | None = None) -> Layers:
+        """A version's content, or some parts of it; NotFound where a key is not there.
+
+        Features come in the order of their ids, whatever order they were uploaded in: a part is a set.
+        """
+        entries = {e.key: e for e in version.parts}
+        chosen = list(entries) if keys is None else sorted(set(keys))
+        for key in chosen:
+            if key not in entries:
+                raise NotFound(_missing(version, key))
+        hashes = {key: bytes.fromhex(entries[key].hash) for key in chosen}
+        loaded = parts.load(Draft(self._chunks), hashes, self.blobs.get_many) if hashes else {}
+        return Layers(loaded, version.datum, version.levels)
+
+    def features(
+        self,
+        version: Version,
+        key: PartKey,
+        *,
+        bbox: Box | None = None,
+        crs: Anchor = "local",
+        ids: Collection[str] | None = None,
+    ) -> Features:
+        """Features of a vector part, as they are anchored, by id: all; those whose box meets ``bbox``; those with
+        these ids; or those with both.
+
+        bbox: (minimum x, minimum y, maximum x, maximum y) in metres (crs ``local``) or degrees (``wgs84``, where west >
+        east crosses the antimeridian); features without coordinates are in no box. MissingDatum where the part has
+        items anchored otherwise than ``crs`` and the version has no datum.
+        """
+        draft = Draft(self._chunks)
+        root = self._root(draft, version, key)
+        if bbox is None and ids is None:
+            loaded = self.load(version, [key]).parts[key]
+            assert isinstance(loaded, Features)
+            return loaded
+        if bbox is None:
+            items = parts.items_by_id(draft, root, ids or ())
+        else:
+            frame = None if version.datum is None else local_frame(version.datum)
+            items = parts.features_in_box(draft, root, bbox, crs, frame)
+            if ids is not None:
+                wanted = set(ids)
+                items = {i: item for i, item in items.items() if i in wanted}
+        return parts.features_of(items, parts.read_document(draft, root))
+
+    def get(self, version: Version, key: PartKey, ids: Collection[str]) -> Features:
+        """The features with these ids, as far as they exist; reads only the leaves they are in."""
+        return self.features(version, key, ids=ids)
+
+    def has_ids(self, version: Version, key: PartKey, ids: Collection[str]) -> set[str]:
+        """Those of the ids that the part has; none where there is no such part."""
+        if version.part(key) is None:
+            return set()
+        draft = Draft(self._chunks)
+        return set(parts.find_places(draft, self._root(draft, version, key), sorted(set(ids))))
+
+    def _root(self, draft: Draft, version: Version, key: PartKey) -> PartRoot:
+        if key.layer not in VECTOR_LAYERS:
+            raise Invalid(f"{key.layer} has no features; there are {', '.join(sorted(VECTOR_LAYERS))}")
+        root = roots_of(draft, key, {e.key: e for e in version.parts})
+        if root is None:
+            raise NotFound(_missing(version, key))
+        return root
+
+    def diff(self, a: Version, b: Version) -> dict[str, Any]:
+        """What differs from version a to version b, by layer; reads only what the two do not share.
+
+        Vector layers: ``{added: [ids], changed: [{id, fields}], deleted: [ids]}``, ids of all parts of the layer
+        together. occupancy: ``{grid: {freed, blocked, unknown, other, bbox, fields?}}``, metres. voxels, imagery and
+        resources: ``{name: {added, changed, deleted, fields?}}``, counts of voxels, tiles or files. ``datum`` and
+        ``levels``: ``{from, to}``.
+        """
+        draft = Draft(self._chunks)
+        before, after = {e.key: e for e in a.parts}, {e.key: e for e in b.parts}
+        names = part_names(sorted(before.keys() | after.keys()))
+        out: dict[str, Any] = {}
+        for key in differing_keys(before, after):
+            old, new = roots_of(draft, key, before), roots_of(draft, key, after)
+            if key.layer in VECTOR_LAYERS:
+                changed = difference.features(draft, old, new)
+                layer = out.setdefault(key.layer, {"added": [], "changed": [], "deleted": []})
+                for name, listed in changed.as_dict().items():
+                    layer[name] += listed
+                if changed.document:
+                    layer["document"] = True
+            elif key.layer == "occupancy":
+                out.setdefault(key.layer, {})[names[key]] = difference.cells(draft, old, new).as_dict()
+            else:
+                out.setdefault(key.layer, {})[names[key]] = difference.others(draft, old, new)
+        return out | frame_changes(a.datum, b.datum, a.levels, b.levels)
+
+    def delta_parts(self, a: Version, b: Version) -> Delta:
+        """What turns version a into version b: features put and deleted, changed rectangles of grids."""
+        draft = Draft(self._chunks)
+        before, after = {e.key: e for e in a.parts}, {e.key: e for e in b.parts}
+        features, grids, other = [], [], []
+        for key in differing_keys(before, after):
+            old, new = roots_of(draft, key, before), roots_of(draft, key, after)
+            if key.layer in VECTOR_LAYERS:
+                changed = difference.features(draft, old, new)
+                items = {i: changed.after[i] for i in (*changed.added, *changed.changed)}
+                document = parts.read_document(draft, new) if new is not None and changed.document else {}
+                features.append(FeatureDelta(key, parts.features_of(items, document), tuple(changed.deleted)))
+            elif key.layer == "occupancy":
+                grids.append(_grid_delta(draft, key, old, new))
+            else:
+                other.append(key)
+        moved = frame_changes(a.datum, b.datum, a.levels, b.levels)
+        return Delta(tuple(features), tuple(grids), tuple(other), "datum" in moved, "levels" in moved)
+
+
+def _grid_delta(draft: Draft, key: PartKey, old: PartRoot | None, new: PartRoot | None) -> GridDelta:
+    if new is None:
+        return GridDelta(key, (), deleted=True)
+    if old is None or old.header != new.header:
+        return GridDelta(key, (), whole=True)
+    return GridDelta(key, difference.rectangles(draft, old, new))
+
+
+def _missing(version: Version, key: PartKey) -> str:
+    known = ", ".join(f"{e.key.layer}/{e.key.level}/{e.key.name}" for e in version.parts) or "nothing"
+    return (
+        f"version {version.number} of {version.environment} has no {key.layer} {key.name!r} on level {key.level!r}; it "
+        f"has {known}"
+    )

@@ -1,0 +1,374 @@
+"""Environments: create, clone, find, rename, delete, restore, purge."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from datetime import datetime
+from fnmatch import fnmatchcase
+from typing import Any, Final
+
+from sqlalchemy import Connection, Row, Text, cast, delete, func, insert, or_, select, update
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.exc import IntegrityError
+
+from app.errors import Conflict, Invalid
+from app.model.frame import Datum, Level
+from app.store import outbox, tables
+from app.store.base import (
+    Base,
+    as_environment,
+    check_environment_name,
+    check_tags,
+    environment_row,
+    text,
+    utcnow,
+)
+from app.store.index import meets
+from app.store.manifest import read_version
+from app.store.prepare import frame_changes, summarise, version_root
+from app.store.tree import Draft
+from app.store.values import Box, Environment, Version
+from app.store.versions import insert_version
+
+PAGE: Final = 500
+
+
+class Environments(Base):
+    """The mapped places."""
+
+    def create_environment(
+        self,
+        name: str,
+        *,
+        title: str = "",
+        description: str = "",
+        tags: Sequence[str] = (),
+        author: str = "",
+        datum: Datum | None = None,
+        clone: Version | None = None,
+    ) -> Environment:
+        """A new environment with version 0 (empty) and, with a datum or a clone, version 1.
+
+        clone: a version of any environment whose content becomes version 1; a datum given beside it replaces the
+        clone's. Conflict where the name is taken or not yet purged.
+        """
+        check_environment_name(name)
+        empty = version_root((), None, (Level(),))
+        changes = self._first_changes(datum, clone)
+        now = utcnow()
+        with self._database.write() as connection:
+            new = secrets.token_hex(16)
+            known = connection.execute(
+                select(tables.retired.c.sequence).where(tables.retired.c.name == name)
+            ).scalar_one_or_none()
+            sequence = int(known or 0) + 1
+            values = {
+                "id": new,
+                "name": name,
+                "title": text(title, "a title"),
+                "description": text(description, "a description"),
+                "tags": check_tags(tags),
+                "head": 0,
+                "root": empty,
+                "sequence": sequence,
+                "datum": None,
+                "indexed": 0,
+                "created": now,
+                "updated": now,
+            }
+            _insert_environment(connection, name, values)
+            row = environment_row(connection, name)
+            frame: dict[str, Any] = {"author": text(author, "an author"), "time": now, "sources": (), "warnings": ()}
+            insert_version(
+                connection,
+                row,
+                number=0,
+                root=empty,
+                datum=None,
+                levels=(Level(),),
+                parts=(),
+                changes={},
+                message="",
+                sequence=sequence,
+                indexed=0,
+                **frame,
+            )
+            events: list[dict[str, Any]] = [
+                {"sequence": sequence, "kind": "environment.created", "version": 0, "root": empty}
+            ]
+            events[0] |= {"previous": None, "layers": [], "message": ""}
+            if datum is not None or clone is not None:
+                first, message = _first_version(connection, row, datum, clone)
+                frame["sources"] = first.sources
+                insert_version(
+                    connection,
+                    row,
+                    number=1,
+                    root=first.root,
+                    datum=first.datum,
+                    levels=first.levels,
+                    parts=first.parts,
+                    changes=changes,
+                    message=message,
+                    sequence=sequence + 1,
+                    indexed=1 if not first.parts else 0,
+                    **frame,
+                )
+                events.append(
+                    {
+                        "sequence": sequence + 1,
+                        "kind": "version.created",
+                        "version": 1,
+                        "root": first.root,
+                        "previous": (0, empty),
+                        "layers": outbox.layer_changes((), first.parts),
+                        "message": message,
+                    }
+                )
+            for one in events:
+                outbox.append(connection, environment_id=new, environment=name, author=author, time=now, **one)
+            return as_environment(environment_row(connection, name))
+
+    def _first_changes(self, datum: Datum | None, clone: Version | None) -> dict[str, Any]:
+        changes: dict[str, Any] = {}
+        if clone is not None:
+            changes, _ = summarise(Draft(self._chunks), {}, {e.key: e for e in clone.parts})
+        place = datum or (clone.datum if clone else None)
+        return changes | frame_changes(None, place, (Level(),), clone.levels if clone else (Level(),))
+
+    def environment(self, name: str, *, deleted: bool = False) -> Environment:
+        """The environment; Gone where it is deleted (unless asked for), NotFound where it never was."""
+        with self._database.read() as connection:
+            return as_environment(environment_row(connection, name, deleted=deleted))
+
+    def environments(
+        self,
+        *,
+        q: str | None = None,
+        contains: tuple[float, float] | None = None,
+        bbox: Box | None = None,
+        limit: int = 100,
+        cursor: str | None = None,
+        allowed: str | None = None,
+        deleted: bool = False,
+    ) -> tuple[list[Environment], str | None]:
+        """A page of environments by name, and the cursor of the next page.
+
+        q: in name, title, description or a tag, whatever its case. contains: (latitude, longitude) in degrees that the
+        extent holds. bbox: (west, south, east, north) that it meets, west > east across the antimeridian. allowed: a
+        name pattern (fnmatch). deleted: those that wait for being purged instead of the others.
+        """
+        if limit < 1:
+            raise Invalid(f"limit must be at least 1, got {limit}")
+        table = tables.environment
+        query = select(table).order_by(table.c.name)
+        query = query.where(table.c.deleted.is_not(None) if deleted else table.c.deleted.is_(None))
+        if q:
+            columns = (table.c.name, table.c.title, table.c.description)
+            found = [func.lower(c).contains(q.lower(), autoescape=True) for c in columns]
+            found.append(func.lower(cast(table.c.tags, Text)).contains(q.lower(), autoescape=True))
+            query = query.where(or_(*found))
+        dialect = self._database.engine.dialect.name
+        for box in (None if contains is None else _point_box(contains), bbox):
+            if box is not None:
+                query = query.where(meets(table, table.c.extent, _checked(box), dialect))
+        out: list[Environment] = []
+        after = cursor
+        with self._database.read() as connection:
+            while len(out) <= limit:
+                page = query if after is None else query.where(table.c.name > after)
+                rows = connection.execute(page.limit(PAGE if allowed else limit + 1)).all()
+                out += [as_environment(r) for r in rows if allowed is None or fnmatchcase(r.name, allowed)]
+                if len(rows) < (PAGE if allowed else limit + 1):
+                    break
+                after = rows[-1].name
+        return out[:limit], out[limit - 1].name if len(out) > limit else None
+
+    def update_environment(
+        self,
+        name: str,
+        *,
+        new_name: str | None = None,
+        title: str | None = None,
+        description: str | None = None,
+        tags: Sequence[str] | None = None,
+        author: str = "",
+    ) -> Environment:
+        """Rename or describe. The history stays; listeners are told the end of the old name and the new one's start."""
+        now = utcnow()
+        with self._database.write() as connection:
+            row = environment_row(connection, name, lock=True)
+            values: dict[str, Any] = {"updated": now}
+            if title is not None:
+                values["title"] = text(title, "a title")
+            if description is not None:
+                values["description"] = text(description, "a description")
+            if tags is not None:
+                values["tags"] = check_tags(tags)
+            table = tables.environment
+            connection.execute(update(table).where(table.c.id == row.id).values(values))
+            if new_name is not None and new_name != name:
+                self._rename(connection, row, check_environment_name(new_name), author, now)
+            return as_environment(environment_row(connection, new_name or name))
+
+    def _rename(self, connection: Connection, row: Row[Any], new_name: str, author: str, now: datetime) -> None:
+        table = tables.environment
+        if connection.execute(select(table.c.id).where(table.c.name == new_name)).first():
+            raise Conflict(f"the name {new_name!r} is taken, or its environment is deleted and not yet purged")
+        ended = row.sequence + 1
+        _retire(connection, row.name, ended)
+        used = connection.execute(
+            select(tables.retired.c.sequence).where(tables.retired.c.name == new_name)
+        ).scalar_one_or_none()
+        begun = max(ended, int(used or 0)) + 1
+        try:
+            connection.execute(update(table).where(table.c.id == row.id).values(name=new_name, sequence=begun))
+        except IntegrityError as error:
+            raise Conflict(f"the name {new_name!r} is taken") from error
+        for sequence, name, kind in (
+            (ended, row.name, "environment.deleted"),
+            (begun, new_name, "environment.created"),
+        ):
+            _tell(
+                connection,
+                row,
+                kind,
+                sequence=sequence,
+                name=name,
+                author=author,
+                time=now,
+                message=f"renamed {row.name} to {new_name}",
+            )
+
+    def delete_environment(self, name: str, author: str = "") -> Environment:
+        """Recoverable until purged; the name stays taken."""
+        return self._mark(name, author, deleted=True)
+
+    def restore_environment(self, name: str, author: str = "") -> Environment:
+        """Undo a deletion; Conflict where it is not deleted."""
+        return self._mark(name, author, deleted=False)
+
+    def _mark(self, name: str, author: str, *, deleted: bool) -> Environment:
+        now = utcnow()
+        table = tables.environment
+        with self._database.write() as connection:
+            row = environment_row(connection, name, lock=True, deleted=not deleted)
+            if not deleted and row.deleted is None:
+                raise Conflict(f"the environment {name!r} is not deleted")
+            sequence = row.sequence + 1
+            connection.execute(
+                update(table)
+                .where(table.c.id == row.id)
+                .values(deleted=now if deleted else None, updated=now, sequence=sequence)
+            )
+            kind = "environment.deleted" if deleted else "environment.created"
+            message = "deleted" if deleted else "restored"
+            _tell(connection, row, kind, sequence=sequence, name=name, author=author, time=now, message=message)
+            return as_environment(environment_row(connection, name, deleted=True))
+
+    def purge_environment(self, name: str) -> None:
+        """Remove a deleted environment for good; Conflict where it is not deleted. Its chunks and files go with the
+        next collection, its events stay in the log until they were surely read.
+        """
+        table = tables.environment
+        with self._database.write() as connection:
+            row = environment_row(connection, name, lock=True, deleted=True)
+            if row.deleted is None:
+                raise Conflict(f"the environment {name!r} is not deleted: delete it first, then purge it")
+            _retire(connection, name, row.sequence)
+            connection.execute(delete(table).where(table.c.id == row.id))
+
+
+def _insert_environment(connection: Connection, name: str, values: dict[str, Any]) -> None:
+    table = tables.environment
+    taken = connection.execute(select(table.c.deleted).where(table.c.name == name)).one_or_none()
+    if taken is not None:
+        why = "is taken" if taken.deleted is None else "belongs to a deleted environment: restore it, or purge it"
+        raise Conflict(f"the name {name!r} {why}")
+    try:
+        with connection.begin_nested():
+            connection.execute(insert(table).values(values))
+    except IntegrityError as error:
+        raise Conflict(f"the name {name!r} is taken") from error
+
+
+def _first_version(
+    connection: Connection, row: Row[Any], datum: Datum | None, clone: Version | None
+) -> tuple[Version, str]:
+    """What version 1 holds. A clone is read again in this transaction, so that its chunks are surely still there."""
+    if clone is None:
+        base = read_version(connection, row, 0)
+        place, parts, levels, sources, message = datum, base.parts, base.levels, base.sources, "datum set"
+    else:
+        origin = environment_row(connection, clone.environment, lock=True)
+        base = read_version(connection, origin, clone.number)
+        place, parts, levels, sources = datum or base.datum, base.parts, base.levels, base.sources
+        message = f"cloned from {clone.environment}, version {clone.number}"
+    made = Version(
+        environment=row.name,
+        number=1,
+        root=version_root(parts, place, levels),
+        parent=0,
+        author="",
+        message=message,
+        time=base.time,
+        changes={},
+        sources=sources,
+        warnings=(),
+        datum=place,
+        levels=levels,
+        parts=parts,
+    )
+    return made, message
+
+
+def _tell(
+    connection: Connection,
+    row: Row[Any],
+    kind: Any,
+    *,
+    sequence: int,
+    name: str,
+    author: str,
+    time: datetime,
+    message: str,
+) -> None:
+    outbox.append(
+        connection,
+        environment_id=row.id,
+        environment=name,
+        sequence=sequence,
+        kind=kind,
+        version=row.head,
+        root=row.root,
+        previous=(row.head, row.root),
+        layers=(),
+        message=message,
+        author=text(author, "an author"),
+        time=time,
+    )
+
+
+def _retire(connection: Connection, name: str, sequence: int) -> None:
+    """Remember the last sequence told under a name."""
+    make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
+    statement = make(tables.retired).values(name=name, sequence=sequence)
+    connection.execute(
+        statement.on_conflict_do_update(index_elements=["name"], set_={"sequence": statement.excluded.sequence})
+    )
+
+
+def _point_box(place: tuple[float, float]) -> Box:
+    latitude, longitude = place
+    return (longitude, latitude, longitude, latitude)
+
+
+def _checked(box: Box) -> Box:
+    west, south, east, north = box
+    if not (-180.0 <= west <= 180.0 and -180.0 <= east <= 180.0 and -90.0 <= south <= north <= 90.0):
+        raise Invalid(
+            "a place must be degrees: longitudes within ±180, latitudes within ±90, south not above north; got "
+            f"{', '.join(f'{v:g}' for v in box)}"
+        )
+    return box

@@ -1,0 +1,143 @@
+"""The heads' vector items on earth, for questions across environments: "what stands here".
+
+The index is narrow and can be rebuilt from the trees. A commit that changes few items brings it up to date with itself;
+else ``environment.indexed`` stays behind the head, and the first question catches up by what differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+from sqlalchemy import ColumnElement, Connection, Row, and_, delete, func, insert, or_, select, update
+
+from app.model.layers import VECTOR_LAYERS, Layer, PartKey
+from app.store import difference, tables
+from app.store.base import Base
+from app.store.changes import IndexRows
+from app.store.manifest import read_version
+from app.store.parts import split_box
+from app.store.prepare import differing_keys, index_rows, roots_of
+from app.store.tree import Draft
+from app.store.values import Box, Found, PartEntry, Version
+
+BATCH: Final = 500
+
+
+def apply(connection: Connection, environment_id: str, rows: Sequence[IndexRows]) -> None:
+    """Bring the index to what these changes say."""
+    table = tables.place
+    for one in rows:
+        here = and_(
+            table.c.environment_id == environment_id,
+            table.c.layer == one.key.layer,
+            table.c.level == one.key.level,
+            table.c.name == one.key.name,
+        )
+        for start in range(0, len(one.removed), BATCH):
+            some = list(one.removed[start : start + BATCH])
+            connection.execute(delete(table).where(here, table.c.feature.in_(some)))
+        if one.put:
+            connection.execute(
+                insert(table),
+                [
+                    {
+                        "environment_id": environment_id,
+                        "layer": one.key.layer,
+                        "level": one.key.level,
+                        "name": one.key.name,
+                        "feature": i,
+                        "west": box[0],
+                        "south": box[1],
+                        "east": box[2],
+                        "north": box[3],
+                        "geometry": wkb,
+                    }
+                    for i, box, wkb in one.put
+                ],
+            )
+
+
+def meets(table: Any, geometry: ColumnElement[Any], box: Box, dialect: str) -> ColumnElement[bool]:
+    """A condition: the row's box, or on PostgreSQL its geometry's, meets a box in degrees."""
+    conditions: list[ColumnElement[bool]] = []
+    for west, south, east, north in split_box(box):
+        if dialect == "postgresql":
+            envelope = func.ST_MakeEnvelope(west, south, east, north, 4326)
+            conditions.append(func.ST_Intersects(geometry, envelope))
+            continue
+        across = table.c.west > table.c.east
+        inside = and_(table.c.west <= east, table.c.east >= west)
+        wrapped = and_(across, or_(table.c.west <= east, table.c.east >= west))
+        conditions.append(and_(table.c.south <= north, table.c.north >= south, or_(and_(~across, inside), wrapped)))
+    return or_(*conditions)
+
+
+class SpatialIndex(Base):
+    """Questions across environments."""
+
+    def find(self, bbox: Box, *, layer: Layer | None = None, limit: int = 1000) -> list[Found]:
+        """Features of all environments' heads that meet ``bbox`` (west, south, east, north; west > east crosses the
+        antimeridian): by their box on SQLite, by their geometry on PostgreSQL. Sorted by environment, part and id.
+        """
+        if not self.readonly:
+            self.refresh_index()
+        table, owner = tables.place, tables.environment
+        query = (
+            select(table, owner.c.name.label("environment"))
+            .join(owner, owner.c.id == table.c.environment_id)
+            .where(
+                owner.c.deleted.is_(None),
+                meets(table, table.c.geometry, bbox, self._database.engine.dialect.name),
+            )
+            .order_by(owner.c.name, table.c.layer, table.c.level, table.c.name, table.c.feature)
+        )
+        if layer is not None:
+            query = query.where(table.c.layer == layer)
+        with self._database.read() as connection:
+            rows = connection.execute(query.limit(limit)).all()
+        return [
+            Found(r.environment, PartKey(r.layer, r.level, r.name), r.feature, (r.west, r.south, r.east, r.north))
+            for r in rows
+        ]
+
+    def refresh_index(self) -> int:
+        """Bring the index of every environment to its head; how many were behind."""
+        table = tables.environment
+        with self._database.read() as connection:
+            behind = list(connection.execute(select(table.c.id).where(table.c.indexed != table.c.head)).scalars())
+        for environment_id in behind:
+            self._refresh(environment_id)
+        return len(behind)
+
+    def _refresh(self, environment_id: str) -> None:
+        table = tables.environment
+        with self._database.write() as connection:
+            row = connection.execute(select(table).where(table.c.id == environment_id).with_for_update()).one_or_none()
+            if row is None or row.indexed == row.head:
+                return
+            head = read_version(connection, row, row.head)
+            before = read_version(connection, row, row.indexed) if row.indexed >= 0 else None
+            self._catch_up(connection, row, before, head)
+            connection.execute(update(table).where(table.c.id == row.id).values(indexed=row.head))
+
+    def _catch_up(self, connection: Connection, row: Row[Any], before: Version | None, head: Version) -> None:
+        old: dict[PartKey, PartEntry] = {}
+        if before is not None and before.datum == head.datum:
+            old = {e.key: e for e in before.parts}
+        else:
+            connection.execute(delete(tables.place).where(tables.place.c.environment_id == row.id))
+        new = {e.key: e for e in head.parts}
+        draft = Draft(self._chunks)
+        for key in differing_keys(old, new):
+            if key.layer not in VECTOR_LAYERS:
+                continue
+            changed = difference.features(draft, roots_of(draft, key, old), roots_of(draft, key, new))
+            apply(connection, row.id, index_rows({key: changed}, head.datum, None) or ())
+
+    def rebuild_index(self) -> None:
+        """Throw the index away and make it anew from the trees."""
+        with self._database.write() as connection:
+            connection.execute(delete(tables.place))
+            connection.execute(update(tables.environment).values(indexed=-1))
+        self.refresh_index()

@@ -1,0 +1,102 @@
+"""Jobs: work that takes long, and what became of it."""
+
+from __future__ import annotations
+
+import secrets
+from typing import Any
+
+from sqlalchemy import Row, delete, insert, select, update
+
+from app.errors import NotFound
+from app.store import tables
+from app.store.base import Base, clean, text, utcnow
+from app.store.values import Job, State
+
+
+class Jobs(Base):
+    """The queue's memory."""
+
+    def create_job(self, owner: str = "", detail: str = "") -> Job:
+        """A queued job."""
+        now = utcnow()
+        new = secrets.token_hex(16)
+        with self._database.write() as connection:
+            connection.execute(
+                insert(tables.job).values(
+                    id=new,
+                    state="queued",
+                    progress=0.0,
+                    detail=clean(detail),
+                    result=None,
+                    problem=None,
+                    owner=text(owner, "an owner"),
+                    created=now,
+                    updated=now,
+                )
+            )
+        return self.job(new)
+
+    def update_job(
+        self,
+        id: str,
+        *,
+        state: State | None = None,
+        progress: float | None = None,
+        detail: str | None = None,
+        result: dict[str, Any] | None = None,
+        problem: dict[str, Any] | None = None,
+    ) -> Job:
+        """Change what is given; a job that is done, failed or cancelled keeps its state. NotFound."""
+        table = tables.job
+        given = {
+            "state": state,
+            "progress": None if progress is None else min(1.0, max(0.0, progress)),
+            "detail": None if detail is None else clean(detail),
+            "result": result,
+            "problem": problem,
+        }
+        values = {name: value for name, value in given.items() if value is not None}
+        with self._database.write() as connection:
+            row = connection.execute(select(table).where(table.c.id == id).with_for_update()).one_or_none()
+            if row is None:
+                raise NotFound(f"there is no job {id[:80]!r}")
+            if row.state not in ("done", "failed", "cancelled"):
+                connection.execute(update(table).where(table.c.id == id).values(updated=utcnow(), **values))
+            return _as_job(connection.execute(select(table).where(table.c.id == id)).one())
+
+    def job(self, id: str) -> Job:
+        """A job; NotFound."""
+        with self._database.read() as connection:
+            row = connection.execute(select(tables.job).where(tables.job.c.id == id)).one_or_none()
+        if row is None:
+            raise NotFound(f"there is no job {id[:80]!r}")
+        return _as_job(row)
+
+    def jobs(self, *, state: State | None = None) -> list[Job]:
+        """Jobs, oldest first."""
+        table = tables.job
+        query = select(table).order_by(table.c.created, table.c.id)
+        if state is not None:
+            query = query.where(table.c.state == state)
+        with self._database.read() as connection:
+            return [_as_job(r) for r in connection.execute(query)]
+
+    def delete_job(self, id: str) -> None:
+        """Forget a job; NotFound."""
+        with self._database.write() as connection:
+            if not connection.execute(delete(tables.job).where(tables.job.c.id == id)).rowcount:
+                raise NotFound(f"there is no job {id[:80]!r}")
+
+
+def _as_job(row: Row[Any]) -> Job:
+    return Job(
+        row.id,
+        row.state,
+        row.progress,
+        row.detail,
+        row.result,
+        row.problem,
+        row.created,
+        row.updated,
+        row.owner,
+    )

@@ -1,0 +1,106 @@
+"""Version rows as values: the manifest says what a version holds, the content itself is in chunks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import ormsgpack
+from sqlalchemy import Connection, Row, select
+
+from app.errors import Damaged, NotFound, Problem
+from app.model.frame import Datum, Level
+from app.model.layers import PartKey
+from app.store import tables
+from app.store.encode import compress, decompress, pack
+from app.store.values import Box, PartEntry, Provenance, Source, Version
+
+MANIFEST: Final = 1
+"""The form of a version's manifest: [1, datum, levels, parts]; old forms stay readable by this number."""
+
+
+def pack_manifest(datum: Datum | None, levels: Sequence[Level], parts: Sequence[PartEntry]) -> bytes:
+    """What a version holds, without the content itself."""
+    rows = [
+        [
+            e.key.layer,
+            e.key.level,
+            e.key.name,
+            bytes.fromhex(e.hash),
+            e.count,
+            _listed(e.bounds.get("local")),
+            _listed(e.bounds.get("wgs84")),
+            bytes.fromhex(e.digest),
+            e.provenance.as_dict(),
+        ]
+        for e in parts
+    ]
+    place = datum.as_dict() if datum else None
+    return compress(pack([MANIFEST, place, [[v.name, v.elevation] for v in levels], rows]))
+
+
+def _listed(box: Box | None) -> list[float] | None:
+    return None if box is None else list(box)
+
+
+def unpack_manifest(data: bytes) -> tuple[Datum | None, tuple[Level, ...], tuple[PartEntry, ...]]:
+    """The reverse."""
+    form, place, levels, rows = ormsgpack.unpackb(decompress(data))
+    if form != MANIFEST:
+        raise Damaged("a version has a manifest that this release does not know: was it written by a newer one?")
+    parts = tuple(
+        PartEntry(
+            PartKey(layer, level, name),
+            h.hex(),
+            count,
+            {"local": tuple(local) if local else None, "wgs84": tuple(wgs84) if wgs84 else None},
+            Provenance.from_dict(provenance),
+            digest=digest.hex(),
+        )
+        for layer, level, name, h, count, local, wgs84, digest, provenance in rows
+    )
+    return (Datum(**place) if place else None), tuple(Level(n, e) for n, e in levels), parts
+
+
+def as_version(environment: str, row: Row[Any], sources: Sequence[Source]) -> Version:
+    """A row and its sources as a value."""
+    datum, levels, parts = unpack_manifest(bytes(row.manifest))
+    return Version(
+        environment=environment,
+        number=row.number,
+        root=row.root,
+        parent=row.parent,
+        author=row.author,
+        message=row.message,
+        time=row.time,
+        changes=row.changes,
+        sources=tuple(sources),
+        warnings=tuple(Problem(w["problem"], w.get("file"), w.get("line"), w.get("where")) for w in row.warnings),
+        datum=datum,
+        levels=levels,
+        parts=parts,
+    )
+
+
+def read_sources(connection: Connection, environment_id: str, numbers: Sequence[int]) -> dict[int, list[Source]]:
+    """The sources of some versions, in the order they came."""
+    table = tables.source
+    query = (
+        select(table)
+        .where(table.c.environment_id == environment_id, table.c.number.in_(list(numbers)))
+        .order_by(table.c.number, table.c.position)
+    )
+    out: dict[int, list[Source]] = {n: [] for n in numbers}
+    for r in connection.execute(query):
+        out[r.number].append(Source(r.name, r.size, r.sha256, r.format, r.used))
+    return out
+
+
+def read_version(connection: Connection, environment: Row[Any], number: int) -> Version:
+    """One version; NotFound."""
+    table = tables.version
+    query = select(table).where(table.c.environment_id == environment.id, table.c.number == number)
+    row = connection.execute(query).one_or_none()
+    if row is None:
+        raise NotFound(f"{environment.name} has no version {number}; it has versions 0 to {environment.head}")
+    return as_version(environment.name, row, read_sources(connection, environment.id, [number])[number])

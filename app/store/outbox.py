@@ -1,0 +1,103 @@
+"""The outbox: events in the transaction of the change they tell of. It is also the log that clients resume from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from typing import Any, Literal
+
+from sqlalchemy import Connection, insert, select, update
+
+from app.store import tables
+from app.store.base import Base, environment_row
+from app.store.values import Event, PartEntry, rfc3339
+
+EventType = Literal["version.created", "channel.planned", "channel.moved", "environment.created", "environment.deleted"]
+
+
+def layer_changes(before: Sequence[PartEntry], after: Sequence[PartEntry]) -> list[dict[str, Any]]:
+    """``[{layer, level, name, change, hash}]`` for the parts that differ, by key."""
+    old = {e.key: e.hash for e in before}
+    new = {e.key: e.hash for e in after}
+    out = []
+    for key in sorted(old.keys() | new.keys()):
+        if old.get(key) == new.get(key):
+            continue
+        change = "added" if key not in old else "deleted" if key not in new else "changed"
+        out.append({"layer": key.layer, "level": key.level, "name": key.name, "change": change, "hash": new.get(key)})
+    return out
+
+
+def append(
+    connection: Connection,
+    *,
+    environment_id: str,
+    environment: str,
+    sequence: int,
+    kind: EventType,
+    version: int,
+    root: str,
+    previous: tuple[int, str] | None,
+    layers: Sequence[Mapping[str, Any]],
+    message: str,
+    author: str,
+    time: datetime,
+    **more: Any,
+) -> None:
+    """Add one event. The caller holds the environment's row and stores ``sequence`` in it.
+
+    Call it last: it takes the lock that puts all environments' events in one order.
+    """
+    body = {
+        "sequence": sequence,
+        "type": kind,
+        "environment": environment,
+        "version": version,
+        "root": root,
+        "previous": None if previous is None else {"version": previous[0], "root": previous[1]},
+        **more,
+        "layers": list(layers),
+        "message": message,
+        "author": author,
+        "time": rfc3339(time),
+    }
+    position = connection.execute(
+        update(tables.log)
+        .where(tables.log.c.id == 1)
+        .values(position=tables.log.c.position + 1)
+        .returning(tables.log.c.position)
+    ).scalar_one()
+    connection.execute(
+        insert(tables.event).values(
+            position=position,
+            environment_id=environment_id,
+            environment=environment,
+            sequence=sequence,
+            body=body,
+            time=time,
+        )
+    )
+
+
+class Outbox(Base):
+    """Reading the log."""
+
+    def events(self, environment: str | None, since: int = 0, limit: int = 1000) -> list[Event]:
+        """Events after ``since``, oldest first: a sequence with an environment, else a position of the whole log."""
+        table = tables.event
+        with self._database.read() as connection:
+            query = select(table)
+            if environment is None:
+                query = query.where(table.c.position > since).order_by(table.c.position)
+            else:
+                row = environment_row(connection, environment, deleted=True)
+                query = query.where(table.c.environment_id == row.id, table.c.sequence > since).order_by(
+                    table.c.sequence
+                )
+            rows = connection.execute(query.limit(limit)).all()
+        return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in rows]
+
+    def last_position(self) -> int:
+        """The position of the newest event."""
+        with self._database.read() as connection:
+            return int(connection.execute(select(tables.log.c.position).where(tables.log.c.id == 1)).scalar_one())

@@ -1,0 +1,296 @@
+"""Working out a version: operations on trees, what they change, and the new chunks. Reads and computes only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from app.errors import Invalid, NotFound
+from app.model.frame import Datum, Level
+from app.model.geodesy import local_frame
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import LAYERS, PART_TYPES, VECTOR_LAYERS, PartKey
+from app.store import difference, parts, tree
+from app.store.changes import KEEP, Changes, Delete, Drop, IndexRows, Operation, Prepared, Replace
+from app.store.difference import CellChanges, FeatureChanges
+from app.store.encode import bounds, compress, from_wkb, root_hash, to_wkb
+from app.store.parts import Item, Made, PartRoot
+from app.store.tree import Draft
+from app.store.values import PartEntry, Provenance, Version
+
+MAX_INDEX_ROWS: Final = 2000
+"""Up to so many changed features the head's index is brought up to date with the commit, beyond when it is asked."""
+
+
+def prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
+    """A version on top of a base."""
+    entries = {entry.key: entry for entry in base.parts}
+    blobs: dict[str, bytes] = {}
+    replaced: dict[PartKey, Replace] = {}
+    for operation in changes.operations:
+        made = _apply(draft, entries, operation)
+        if made is not None:
+            blobs.update(made.blobs)
+        if isinstance(operation, Replace):
+            replaced[operation.key] = operation
+        else:
+            replaced.pop(operation.key, None)
+    datum = base.datum if changes.datum is KEEP else changes.datum
+    levels = base.levels if changes.levels is KEEP else _check_levels(changes.levels)
+    listed = tuple(entries[key] for key in sorted(entries))
+    root = version_root(listed, datum, levels)
+    if root == base.root:
+        return Prepared(base.number, root, {}, base.parts, datum, levels, {}, changed=False)
+    before = {entry.key: entry for entry in base.parts}
+    what, features = summarise(draft, before, entries, replaced)
+    what |= frame_changes(base.datum, datum, base.levels, levels)
+    index = None
+    if datum == base.datum:
+        index = index_rows(features, datum)
+    return Prepared(
+        base.number,
+        root,
+        _fresh(draft, before, entries),
+        listed,
+        datum,
+        levels,
+        what,
+        changed=True,
+        blobs=blobs,
+        index=index,
+    )
+
+
+def version_root(entries: Sequence[PartEntry], datum: Datum | None, levels: Sequence[Level]) -> str:
+    """The version's root hash."""
+    return root_hash(((e.key.layer, e.key.level, e.key.name, e.hash) for e in entries), datum, levels)
+
+
+def _check_levels(levels: Sequence[Level]) -> tuple[Level, ...]:
+    names = [level.name for level in levels]
+    if len(set(names)) != len(names):
+        raise Invalid(f"two levels have the same name: {', '.join(sorted(names))}")
+    return tuple(sorted(levels, key=lambda level: (level.elevation, level.name)))
+
+
+def _apply(draft: Draft, entries: dict[PartKey, PartEntry], operation: Operation) -> Made | None:
+    key = operation.key
+    entry = entries.get(key)
+    what = f"{key.layer} {key.name!r} on level {key.level!r}"
+    if isinstance(operation, Drop):
+        if entry is None:
+            raise NotFound(f"there is no {what}")
+        del entries[key]
+        return None
+    root = parts.read_root(draft, bytes.fromhex(entry.hash)) if entry else None
+    if isinstance(operation, Replace):
+        if not isinstance(operation.part, PART_TYPES[key.layer]):
+            raise Invalid(f"{what} must be {PART_TYPES[key.layer].__name__}, got {type(operation.part).__name__}")
+        made = parts.compose(draft, operation.part, root, entry.digest if entry else "")
+        if made is None and entry is not None:
+            entries[key] = replace(entry, provenance=operation.provenance)
+            return None
+        assert made is not None
+        entries[key] = PartEntry(
+            key, made.hash.hex(), made.count, made.bounds, operation.provenance, digest=made.digest
+        )
+        return made
+    if key.layer not in VECTOR_LAYERS:
+        raise Invalid(f"{what} has no features to put or delete: replace it as a whole")
+    if isinstance(operation, Delete):
+        if entry is None or root is None:
+            raise NotFound(f"there is no {what}")
+        made = parts.edit_features(draft, root, None, set(operation.ids), what)
+        provenance = entry.provenance
+    else:
+        root = root or parts.read_root(draft, parts.empty_features(draft))
+        made = parts.edit_features(draft, root, operation.features, (), what)
+        provenance = joined(entry.provenance, operation.provenance) if entry else operation.provenance
+    digest = entry.digest if entry and made.hash.hex() == entry.hash else ""
+    entries[key] = PartEntry(key, made.hash.hex(), made.count, made.bounds, provenance, digest=digest)
+    return made
+
+
+def joined(old: Provenance, new: Provenance) -> Provenance:
+    """Of a part to which features were added: raw where anything in it is, and all sources, steps and credits."""
+    return Provenance(
+        information="raw" if "raw" in (old.information, new.information) else new.information,
+        format=old.format or new.format,
+        sources=tuple(dict.fromkeys((*old.sources, *new.sources))),
+        upload=None,
+        steps=(*old.steps, *(step for step in new.steps if step not in old.steps)),
+        attribution=tuple(dict.fromkeys((*old.attribution, *new.attribution))),
+    )
+
+
+# --- what changed ---
+
+
+def roots_of(draft: Draft, key: PartKey, entries: Mapping[PartKey, PartEntry]) -> PartRoot | None:
+    """The decoded root of a part, or None."""
+    entry = entries.get(key)
+    return parts.read_root(draft, bytes.fromhex(entry.hash)) if entry else None
+
+
+def differing_keys(before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, PartEntry]) -> list[PartKey]:
+    """The keys of parts that differ, by layer as the layers are listed."""
+
+    def differs(key: PartKey) -> bool:
+        a, b = before.get(key), after.get(key)
+        return a is None or b is None or a.hash != b.hash
+
+    keys = [key for key in before.keys() | after.keys() if differs(key)]
+    return sorted(keys, key=lambda key: (LAYERS.index(key.layer), key))
+
+
+def part_names(keys: Sequence[PartKey]) -> dict[PartKey, str]:
+    """What a part is called among those of its layer: its name, with the level where that alone is not enough."""
+    seen: dict[tuple[str, str], int] = {}
+    for key in keys:
+        seen[key.layer, key.name] = seen.get((key.layer, key.name), 0) + 1
+    return {key: key.name if seen[key.layer, key.name] == 1 else f"{key.level}/{key.name}" for key in keys}
+
+
+def summarise(
+    draft: Draft,
+    before: Mapping[PartKey, PartEntry],
+    after: Mapping[PartKey, PartEntry],
+    replaced: Mapping[PartKey, Replace] | None = None,
+) -> tuple[dict[str, Any], dict[PartKey, FeatureChanges] | None]:
+    """Counts by layer, and the changed features of each vector part (None where they are too many for the index)."""
+    out: dict[str, Any] = {}
+    features: dict[PartKey, FeatureChanges] | None = {}
+    keys = differing_keys(before, after)
+    names = part_names(sorted(before.keys() | after.keys()))
+    for key in keys:
+        a, b = before.get(key), after.get(key)
+        if key.layer in VECTOR_LAYERS:
+            total = out.setdefault(key.layer, {"added": 0, "changed": 0, "deleted": 0})
+            if (a is None or not a.count) and b is not None and b.count > MAX_INDEX_ROWS:
+                total["added"] += b.count
+                features = None
+                continue
+            if (b is None or not b.count) and a is not None and a.count > MAX_INDEX_ROWS:
+                total["deleted"] += a.count
+                features = None
+                continue
+            changed = difference.features(draft, roots_of(draft, key, before), roots_of(draft, key, after))
+            for name, count in changed.counts().items():
+                total[name] += count
+            if changed.document:
+                total["document"] = True
+            if features is not None:
+                features[key] = changed
+        elif key.layer == "occupancy":
+            operation = (replaced or {}).get(key)
+            new = operation.part if operation else None
+            if a is None and isinstance(new, OccupancyGrid):
+                cells = cells_added(new)
+            else:
+                cells = difference.cells(draft, roots_of(draft, key, before), roots_of(draft, key, after))
+            out.setdefault(key.layer, {})[names[key]] = cells.as_dict()
+        else:
+            other = difference.others(draft, roots_of(draft, key, before), roots_of(draft, key, after))
+            out.setdefault(key.layer, {})[names[key]] = other
+    return out, features
+
+
+def cells_added(grid: OccupancyGrid) -> CellChanges:
+    """The changes that a new grid is: every known cell was unknown before."""
+    out = CellChanges()
+    known = grid.cells != UNKNOWN
+    total = int(known.sum())
+    out.freed = int((grid.cells == FREE).sum())
+    out.blocked = int((grid.cells == OCCUPIED).sum())
+    out.other = total - out.freed - out.blocked
+    if total:
+        rows = np.flatnonzero(known.any(axis=1))
+        columns = np.flatnonzero(known.any(axis=0))
+        header = {"origin": list(grid.origin), "resolution": grid.resolution}
+        out.box = difference.cell_box(
+            header, float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
+        )
+    return out
+
+
+def frame_changes(
+    old: Datum | None, new: Datum | None, old_levels: Sequence[Level], new_levels: Sequence[Level]
+) -> dict[str, Any]:
+    """``datum`` and ``levels``, where they differ, from and to."""
+    out: dict[str, Any] = {}
+    if old != new:
+        out["datum"] = {"from": old.as_dict() if old else None, "to": new.as_dict() if new else None}
+    if sorted((v.name, v.elevation) for v in old_levels) != sorted((v.name, v.elevation) for v in new_levels):
+        out["levels"] = {
+            "from": [{"name": v.name, "elevation": v.elevation} for v in old_levels],
+            "to": [{"name": v.name, "elevation": v.elevation} for v in new_levels],
+        }
+    return out
+
+
+# --- the head's index ---
+
+
+def index_rows(
+    changed: Mapping[PartKey, FeatureChanges] | None, datum: Datum | None, most: int | None = MAX_INDEX_ROWS
+) -> tuple[IndexRows, ...] | None:
+    """The changes to the head's index, None where they are more than ``most``."""
+    if changed is None:
+        return None
+    count = sum(len(c.added) + len(c.changed) + len(c.deleted) for c in changed.values())
+    if most is not None and count > most:
+        return None
+    out = []
+    for key in sorted(changed):
+        c = changed[key]
+        items = {i: c.after[i] for i in (*c.added, *c.changed)}
+        out.append(IndexRows(key, (*c.changed, *c.deleted), placed(items, datum)))
+    return tuple(out)
+
+
+def placed(
+    items: Mapping[str, Item], datum: Datum | None
+) -> tuple[tuple[str, tuple[float, float, float, float], bytes], ...]:
+    """(id, box in degrees, WKB in degrees) of the items that have a place on earth."""
+    chosen = [i for i, item in items.items() if item.anchor == 1 or datum is not None]
+    if not chosen:
+        return ()
+    geometry = from_wkb([items[i].wkb for i in chosen])
+    local = np.array([items[i].anchor == 0 for i in chosen])
+    if datum is not None and local.any():
+        geometry[local] = local_frame(datum).geometries_to_wgs84(geometry[local])
+    boxes = bounds(geometry)
+    wkb = to_wkb(geometry)
+    out = []
+    for k in np.flatnonzero(np.isfinite(boxes).all(axis=1)).tolist():
+        west, south, east, north = boxes[k].tolist()
+        if east - west > 180.0:
+            west, south, east, north = parts.crossing_box(parts.coordinates(geometry[k]))
+        out.append((chosen[k], (west, south, east, north), bytes(wkb[k])))
+    return tuple(out)
+
+
+# --- chunks that the base does not have ---
+
+
+def _fresh(draft: Draft, before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, PartEntry]) -> dict[str, bytes]:
+    """Hash (hex) -> stored bytes of the chunks of changed parts that were not read from the store."""
+    out: dict[bytes, bytes] = {}
+    for key in differing_keys(before, after):
+        entry = after.get(key)
+        if entry is None:
+            continue
+        old = roots_of(draft, key, before)
+        known: set[bytes] = set()
+        if old is not None:
+            for node in old.trees.values():
+                known |= tree.names(draft, node)
+        new, tiles = parts.new_chunks(draft, bytes.fromhex(entry.hash), known)
+        for name in new:
+            if name not in out:
+                out[name] = compress(draft.new[name])
+        out.update((name, draft.stored[name]) for name in tiles)
+    return {name.hex(): data for name, data in out.items()}

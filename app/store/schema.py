@@ -1,0 +1,79 @@
+"""Migrations: Alembic's, run from code; in a checkout they lie in ``migrations``, in a wheel in ``app/_migrations``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from alembic import command
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import exc
+
+from app.errors import Unavailable
+from app.store.database import Database, translated
+from app.store.tables import metadata
+
+LOCK = 4_820_117_001
+"""PostgreSQL's advisory lock: two servers that start together migrate one after the other."""
+
+
+def folder() -> Path:
+    """Where the migrations are."""
+    package = Path(__file__).resolve().parents[1]
+    for path in (package / "_migrations", package.parent / "migrations"):
+        if (path / "env.py").is_file():
+            return path
+    raise Unavailable("the migrations are missing from this installation: install it again")
+
+
+def config() -> Config:
+    """Alembic's settings, without a file."""
+    made = Config()
+    made.set_main_option("script_location", str(folder()).replace("%", "%%"))
+    made.set_main_option("path_separator", "os")
+    return made
+
+
+def comparison(dialect: str) -> dict[str, Any]:
+    """Options for Alembic to compare a database with the models: without PostGIS' own tables, and without the indexes
+    that another dialect has.
+    """
+
+    def ours(thing: Any, name: str | None, kind: str, reflected: bool, compared_to: Any) -> bool:
+        del compared_to
+        if kind == "table":
+            return name in metadata.tables
+        return kind != "index" or reflected or thing.info.get("dialect", dialect) == dialect
+
+    return {"compare_type": True, "include_object": ours}
+
+
+def upgrade(database: Database) -> None:
+    """To the newest schema."""
+    settings = config()
+    with translated(), database.engine.connect() as connection:
+        connection.execution_options(write=True)
+        try:
+            with connection.begin():
+                if not database.sqlite:
+                    connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({LOCK})")
+                settings.attributes["connection"] = connection
+                command.upgrade(settings, "head")
+        except exc.ProgrammingError as error:
+            raise Unavailable(
+                f"the database cannot be migrated: {str(error.orig).splitlines()[0]}. On PostgreSQL PostGIS must be "
+                "installed, and created in the database by a superuser where ours may not: CREATE EXTENSION postgis"
+            ) from error
+
+
+def check(database: Database) -> None:
+    """Unavailable unless the schema is the newest."""
+    newest = ScriptDirectory.from_config(config()).get_current_head()
+    with translated(), database.engine.connect() as connection:
+        present = MigrationContext.configure(connection).get_current_revision()
+    if present != newest:
+        raise Unavailable(
+            f"the database's schema is {present or 'not there'}, this release needs {newest}: run fleetmap migrate"
+        )

@@ -1,0 +1,95 @@
+"""Access tokens: kept as SHA-256, compared in constant time."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import secrets
+from datetime import datetime
+from typing import Any, Final, get_args
+
+from sqlalchemy import Row, delete, insert, select
+from sqlalchemy.exc import IntegrityError
+
+from app.errors import Conflict, Invalid, NotFound
+from app.store import tables
+from app.store.base import Base, text, utcnow
+from app.store.values import Role, Token
+
+SECRET_BYTES: Final = 32
+SHORTEST: Final = 16
+"""Characters that a token chosen by the operator must have at least."""
+
+
+class Tokens(Base):
+    """Who may do what."""
+
+    def create_token(
+        self,
+        name: str,
+        role: Role,
+        environments: str | None = None,
+        robot: str | None = None,
+        expires: datetime | None = None,
+        token: str | None = None,
+    ) -> tuple[Token, str]:
+        """A token and its secret, which is told only now.
+
+        environments: a name pattern (fnmatch). robot: whose status a robot's token may put. token: a secret chosen by
+        the operator; one that exists already is Conflict.
+        """
+        if role not in get_args(Role):
+            raise Invalid(f"a role must be one of {', '.join(get_args(Role))}, got {role!r}")
+        if expires is not None and expires.tzinfo is None:
+            raise Invalid("expires needs a time zone, for example 2027-01-01T00:00:00Z")
+        if token is not None and len(token) < SHORTEST:
+            raise Invalid(f"a chosen token must have at least {SHORTEST} characters")
+        secret = token or secrets.token_urlsafe(SECRET_BYTES)
+        values: dict[str, Any] = {
+            "id": secrets.token_hex(8),
+            "name": text(name, "a token's name", 256),
+            "role": role,
+            "environments": None if environments is None else text(environments, "a name pattern", 256),
+            "robot": None if robot is None else text(robot, "a robot's name", 256),
+            "expires": expires,
+            "created": utcnow(),
+        }
+        try:
+            with self._database.write() as connection:
+                connection.execute(insert(tables.token).values(hash=_hash(secret), **values))
+        except IntegrityError as error:
+            raise Conflict("this token exists already") from error
+        return Token(**values), secret
+
+    def tokens(self) -> list[Token]:
+        """All tokens, oldest first."""
+        table = tables.token
+        with self._database.read() as connection:
+            rows = connection.execute(select(table).order_by(table.c.created, table.c.id)).all()
+        return [_as_token(r) for r in rows]
+
+    def delete_token(self, id: str) -> None:
+        """Revoke a token; NotFound."""
+        with self._database.write() as connection:
+            if not connection.execute(delete(tables.token).where(tables.token.c.id == id)).rowcount:
+                raise NotFound(f"there is no token {id[:80]!r}")
+
+    def find_token(self, text: str) -> Token | None:
+        """The token with this secret, unless unknown or expired."""
+        if len(text) > 4096:
+            return None
+        wanted = _hash(text)
+        with self._database.read() as connection:
+            row = connection.execute(select(tables.token).where(tables.token.c.hash == wanted)).one_or_none()
+        if row is None or not hmac.compare_digest(row.hash, wanted):
+            return None
+        found = _as_token(row)
+        return None if found.expires is not None and found.expires <= utcnow() else found
+
+
+def _hash(secret: str) -> str:
+    return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _as_token(row: Row[Any]) -> Token:
+    return Token(row.id, row.name, row.role, row.environments, row.robot, row.expires, row.created)

@@ -1,0 +1,358 @@
+"""Versions: reading them, committing a prepared one, keeping further sources, reverting."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime
+from typing import Any, Final
+
+from sqlalchemy import Connection, Row, func, insert, select, update
+
+from app.errors import Conflict, Invalid, NotFound, Problem, StaleParent, Unavailable
+from app.model.frame import Datum, Level
+from app.store import chunks, index, outbox, tables
+from app.store.base import Base, clean, clean_problem, environment_row, text, utcnow
+from app.store.changes import Changes, Prepared
+from app.store.extent import extent, geometry
+from app.store.manifest import as_version, pack_manifest, read_sources, read_version
+from app.store.prepare import frame_changes, prepare, summarise
+from app.store.tree import Draft
+from app.store.values import LATEST, Idempotency, PartEntry, Source, Version
+
+REVERT_TRIES: Final = 8
+
+
+def resolve(connection: Connection, environment: Row[Any], ref: str | int) -> int:
+    """A version's number from a number, ``latest``, or a channel's name; NotFound."""
+    if isinstance(ref, int):
+        return ref
+    if ref == LATEST:
+        return int(environment.head)
+    if ref.isascii() and ref.isdigit() and len(ref) < 10:
+        return int(ref)
+    table = tables.channel
+    query = select(table.c.version).where(table.c.environment_id == environment.id, table.c.name == ref)
+    found = connection.execute(query).scalar_one_or_none()
+    if found is None:
+        raise NotFound(
+            f"{environment.name} has no version or channel {ref[:80]!r}: ask for a number, latest, or a channel that "
+            "was set"
+        )
+    return int(found)
+
+
+def insert_version(
+    connection: Connection,
+    environment: Row[Any],
+    *,
+    number: int,
+    root: str,
+    datum: Datum | None,
+    levels: Sequence[Level],
+    parts: Sequence[PartEntry],
+    changes: Mapping[str, Any],
+    sources: Sequence[Source],
+    warnings: Sequence[Problem],
+    author: str,
+    message: str,
+    time: datetime,
+    sequence: int,
+    indexed: int,
+) -> None:
+    """Write a version's rows and make it the head. The caller holds the environment's row."""
+    connection.execute(
+        insert(tables.version).values(
+            environment_id=environment.id,
+            number=number,
+            root=root,
+            parent=number - 1 if number else None,
+            author=author,
+            message=message,
+            time=time,
+            sequence=sequence,
+            changes=dict(changes),
+            warnings=[clean_problem(w).as_dict() for w in warnings],
+            manifest=pack_manifest(datum, levels, parts),
+        )
+    )
+    insert_sources(connection, environment.id, number, sources, first=0)
+    box = extent(parts, datum)
+    west, south, east, north = box or (None, None, None, None)
+    connection.execute(
+        update(tables.environment)
+        .where(tables.environment.c.id == environment.id)
+        .values(
+            head=number,
+            root=root,
+            sequence=sequence,
+            datum=datum.as_dict() if datum else None,
+            indexed=indexed,
+            updated=time,
+            west=west,
+            south=south,
+            east=east,
+            north=north,
+            extent=geometry(box),
+        )
+    )
+
+
+def insert_sources(
+    connection: Connection, environment_id: str, number: int, sources: Sequence[Source], first: int
+) -> None:
+    """Write source rows; their blobs must be there and are marked as used."""
+    if not sources:
+        return
+    hold_blobs(connection, {s.sha256 for s in sources})
+    connection.execute(
+        insert(tables.source),
+        [
+            {
+                "environment_id": environment_id,
+                "number": number,
+                "position": first + k,
+                "name": clean(s.name),
+                "size": s.size,
+                "sha256": s.sha256,
+                "format": s.format,
+                "used": s.used,
+            }
+            for k, s in enumerate(sources)
+        ],
+    )
+
+
+def hold_blobs(connection: Connection, hashes: set[str]) -> None:
+    """Keep a collection in progress away from blobs that this transaction refers to; Unavailable where one is gone."""
+    now = int(utcnow().timestamp())
+    names = sorted(hashes)
+    for start in range(0, len(names), 500):
+        some = names[start : start + 500]
+        query = select(tables.blob.c.sha256).where(tables.blob.c.sha256.in_(some)).order_by(tables.blob.c.sha256)
+        found = set(connection.execute(query.with_for_update()).scalars())
+        missing = [n for n in some if n not in found]
+        if missing:
+            raise Unavailable(f"the uploaded file {missing[0]} is not in the store (any more): send it again")
+        connection.execute(update(tables.blob).where(tables.blob.c.sha256.in_(some)).values(used=now))
+
+
+class Versions(Base):
+    """Versions of environments."""
+
+    def version(self, environment: str, ref: str | int = LATEST) -> Version:
+        """A version by number, channel or ``latest``; NotFound, or Gone where the environment is deleted."""
+        with self._database.read() as connection:
+            row = environment_row(connection, environment)
+            return read_version(connection, row, resolve(connection, row, ref))
+
+    def versions(self, environment: str, *, limit: int = 100, before: int | None = None) -> list[Version]:
+        """Newest first; ``before``: only those with a smaller number."""
+        table = tables.version
+        with self._database.read() as connection:
+            row = environment_row(connection, environment)
+            query = select(table).where(table.c.environment_id == row.id)
+            if before is not None:
+                query = query.where(table.c.number < before)
+            rows = connection.execute(query.order_by(table.c.number.desc()).limit(limit)).all()
+            sources = read_sources(connection, row.id, [r.number for r in rows])
+        return [as_version(row.name, r, sources[r.number]) for r in rows]
+
+    def prepare(self, base: Version, changes: Changes) -> Prepared:
+        """Work out a version on top of a base. Reads and computes only, so it may run in another process.
+
+        Raises Invalid where something cannot be stored, NotFound where something to delete is not there.
+        """
+        return prepare(Draft(self._chunks), base, changes)
+
+    def commit(
+        self,
+        environment: str,
+        prepared: Prepared,
+        *,
+        author: str,
+        message: str,
+        sources: Sequence[Source] = (),
+        warnings: Sequence[Problem] = (),
+        idempotency: Idempotency | None = None,
+    ) -> Version:
+        """Make the prepared version the head, in one transaction with its event.
+
+        StaleParent where the head has moved since ``prepared.base``. A key that was used before gives the version of
+        then, or Conflict with another fingerprint. A prepared version that changes nothing adds the sources to the
+        head and returns it.
+        """
+        text(author, "an author")
+        text(message, "a message")
+        if prepared.blobs:
+            self.blobs.put_many(list(prepared.blobs.values()))
+        with self._database.write() as connection:
+            row = environment_row(connection, environment, lock=True)
+            known = _replayed(connection, row, idempotency)
+            if known is not None:
+                return read_version(connection, row, known)
+            _check_head(row, prepared.base)
+            now = utcnow()
+            if not prepared.changed:
+                _append_sources(connection, row.id, row.head, sources)
+                _remember(connection, row.id, idempotency, row.head, now)
+                return read_version(connection, row, row.head)
+            before = read_version(connection, row, row.head)
+            chunks.insert(connection, prepared.chunks)
+            hold_blobs(connection, set(prepared.blobs))
+            number, sequence = row.head + 1, row.sequence + 1
+            in_step = prepared.index is not None and row.indexed == row.head
+            if in_step and prepared.index:
+                index.apply(connection, row.id, prepared.index)
+            insert_version(
+                connection,
+                row,
+                number=number,
+                root=prepared.root,
+                datum=prepared.datum,
+                levels=prepared.levels,
+                parts=prepared.parts,
+                changes=prepared.changes,
+                sources=sources,
+                warnings=warnings,
+                author=author,
+                message=message,
+                time=now,
+                sequence=sequence,
+                indexed=number if in_step else row.indexed,
+            )
+            _remember(connection, row.id, idempotency, number, now)
+            made = read_version(connection, row, number)
+            outbox.append(
+                connection,
+                environment_id=row.id,
+                environment=row.name,
+                sequence=sequence,
+                kind="version.created",
+                version=number,
+                root=prepared.root,
+                previous=(before.number, before.root),
+                layers=outbox.layer_changes(before.parts, prepared.parts),
+                message=message,
+                author=author,
+                time=now,
+            )
+        return made
+
+    def add_sources(self, environment: str, version: int, sources: Sequence[Source]) -> Version:
+        """Keep further files with a version: what was uploaded but changed nothing. The version with all of them."""
+        with self._database.write() as connection:
+            row = environment_row(connection, environment, lock=True)
+            read_version(connection, row, version)
+            _append_sources(connection, row.id, version, sources)
+            return read_version(connection, row, version)
+
+    def revert(
+        self,
+        environment: str,
+        to: int,
+        *,
+        author: str,
+        message: str,
+        expected: int | None = None,
+        idempotency: Idempotency | None = None,
+    ) -> Version:
+        """A new version with the content of an old one; the head itself where that is the same content.
+
+        expected: StaleParent where the head is another one; without it the head may move meanwhile.
+        """
+        for attempt in range(REVERT_TRIES):
+            target = self.version(environment, to)
+            head = self.version(environment)
+            if expected is not None and head.number != expected:
+                known = self.idempotent(environment, idempotency.key) if idempotency else None
+                if known is None:
+                    raise StaleParent(f"the head of {environment} is version {head.number}, not {expected}")
+            try:
+                return self.commit(
+                    environment,
+                    self._reverted(head, target),
+                    author=author,
+                    message=message,
+                    idempotency=idempotency,
+                )
+            except StaleParent:
+                if attempt == REVERT_TRIES - 1 or expected is not None:
+                    raise
+        raise AssertionError("unreachable")
+
+    def _reverted(self, head: Version, target: Version) -> Prepared:
+        changed = head.root != target.root
+        changes: dict[str, Any] = {}
+        if changed:
+            before, after = {e.key: e for e in head.parts}, {e.key: e for e in target.parts}
+            changes, _ = summarise(Draft(self._chunks), before, after)
+            changes |= frame_changes(head.datum, target.datum, head.levels, target.levels)
+        return Prepared(
+            head.number, target.root, {}, target.parts, target.datum, target.levels, changes, changed=changed
+        )
+
+    def idempotent(self, environment: str, key: str) -> tuple[str, int] | None:
+        """(fingerprint, version number) of the request that used this key, or None."""
+        table = tables.idempotency
+        with self._database.read() as connection:
+            row = environment_row(connection, environment)
+            query = select(table.c.fingerprint, table.c.version).where(
+                table.c.environment_id == row.id, table.c.key == key
+            )
+            found = connection.execute(query).one_or_none()
+        return None if found is None else (found.fingerprint, found.version)
+
+
+def _check_head(row: Row[Any], base: int) -> None:
+    if row.head != base:
+        raise StaleParent(
+            f"the head of {row.name} is version {row.head}, the change was made for version {base}: look at what "
+            "changed and send it again"
+        )
+
+
+def _replayed(connection: Connection, row: Row[Any], idempotency: Idempotency | None) -> int | None:
+    if idempotency is None:
+        return None
+    table = tables.idempotency
+    query = select(table).where(table.c.environment_id == row.id, table.c.key == idempotency.key)
+    known = connection.execute(query).one_or_none()
+    if known is None:
+        return None
+    if known.fingerprint != idempotency.fingerprint:
+        raise Conflict(f"the Idempotency-Key {idempotency.key!r} was used for another request: choose a new one")
+    return int(known.version)
+
+
+def _remember(
+    connection: Connection, environment_id: str, idempotency: Idempotency | None, version: int, now: datetime
+) -> None:
+    if idempotency is not None:
+        if not 1 <= len(idempotency.key) <= 255:
+            raise Invalid("an Idempotency-Key must have 1 to 255 characters")
+        connection.execute(
+            insert(tables.idempotency).values(
+                environment_id=environment_id,
+                key=text(idempotency.key, "an Idempotency-Key", 255),
+                fingerprint=idempotency.fingerprint,
+                version=version,
+                time=now,
+            )
+        )
+
+
+def _append_sources(connection: Connection, environment_id: str, number: int, sources: Sequence[Source]) -> None:
+    table = tables.source
+    known = read_sources(connection, environment_id, [number])[number]
+    new = [s for s in dict.fromkeys(sources) if not any(s.name == k.name and s.sha256 == k.sha256 for k in known)]
+    last = connection.execute(
+        select(func.max(table.c.position)).where(table.c.environment_id == environment_id, table.c.number == number)
+    ).scalar_one()
+    insert_sources(
+        connection,
+        environment_id,
+        number,
+        [replace(s, used=False) for s in new],
+        first=0 if last is None else last + 1,
+    )

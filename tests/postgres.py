@@ -1,0 +1,170 @@
+"""A throw-away PostgreSQL cluster with PostGIS for a test session, on a free port of the loopback address.
+
+Import the fixtures in a conftest.py: ``from tests.postgres import postgres_cluster, postgres_url``.
+"""
+
+from __future__ import annotations
+
+import os
+import pwd
+import shutil
+import socket
+import subprocess
+import tempfile
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import psycopg
+import pytest
+from psycopg import sql
+
+FOLDERS = ("/usr/local/bin", *(f"/usr/lib/postgresql/{n}/bin" for n in range(20, 12, -1)))
+
+
+@dataclass(frozen=True, slots=True)
+class Cluster:
+    """A running server: one superuser, trusted on the loopback address."""
+
+    port: int
+    bin: Path
+    data: Path
+
+    def url(self, database: str = "postgres") -> str:
+        """For SQLAlchemy."""
+        return f"postgresql+psycopg://fleetmap@127.0.0.1:{self.port}/{database}"
+
+    def connect(self, database: str = "postgres") -> psycopg.Connection[tuple[object, ...]]:
+        """A connection that commits by itself."""
+        return psycopg.connect(
+            host="127.0.0.1", port=self.port, user="fleetmap", dbname=database, autocommit=True, connect_timeout=10
+        )
+
+    def create_database(self) -> str:
+        """A new, empty database with PostGIS; its name."""
+        name = f"t{uuid.uuid4().hex}"
+        with self.connect() as connection:
+            connection.execute(sql.SQL("CREATE DATABASE {} TEMPLATE fleetmap_template").format(sql.Identifier(name)))
+        return name
+
+    def drop_database(self, name: str) -> None:
+        """Remove a database, whoever is connected."""
+        with self.connect() as connection:
+            connection.execute(sql.SQL("DROP DATABASE IF EXISTS {} WITH (FORCE)").format(sql.Identifier(name)))
+
+
+def _missing(message: str) -> None:
+    """CI must leave nothing out; a developer without PostgreSQL may."""
+    if os.environ.get("CI"):
+        pytest.fail(message)
+    pytest.skip(message)
+
+
+def _binaries() -> Path | None:
+    found = shutil.which("initdb")
+    candidates = [*([str(Path(found).resolve().parent)] if found else []), *FOLDERS]
+    for folder in candidates:
+        if (Path(folder) / "initdb").exists() and (Path(folder) / "pg_ctl").exists():
+            return Path(folder)
+    return None
+
+
+def _as_user() -> tuple[list[str], int | None]:
+    """A command prefix that gives up root, since PostgreSQL refuses it, and the user's id."""
+    if os.geteuid() != 0:
+        return [], None
+    for name in ("postgres", "nobody"):
+        try:
+            user = pwd.getpwnam(name)
+        except KeyError:
+            continue
+        if shutil.which("setpriv"):
+            return ["setpriv", f"--reuid={user.pw_uid}", f"--regid={user.pw_gid}", "--clear-groups"], user.pw_uid
+        if shutil.which("runuser"):
+            return ["runuser", "-u", name, "--"], user.pw_uid
+    return [], None
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture(scope="session")
+def postgres_cluster() -> Iterator[Cluster]:
+    """The cluster; skipped where PostgreSQL or PostGIS is not installed, a failure where CI is set."""
+    folder = _binaries()
+    if folder is None:
+        _missing("PostgreSQL is not installed (initdb is not to be found)")
+    assert folder is not None
+    prefix, uid = _as_user()
+    if os.geteuid() == 0 and uid is None:
+        _missing("PostgreSQL does not run as root, and there is no other user to run it as")
+    root = Path(tempfile.mkdtemp(prefix="fleetmap-pg-"))
+    root.chmod(0o755)
+    home = root / "home"
+    home.mkdir()
+    if uid is not None:
+        os.chown(home, uid, -1)
+    data = home / "data"
+    environment = {"PATH": os.environ.get("PATH", ""), "LC_ALL": "C.UTF-8", "HOME": str(home)}
+
+    def run(*command: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [*prefix, *command], capture_output=True, text=True, cwd=home, env=environment, timeout=120, check=False
+        )
+
+    try:
+        made = run(str(folder / "initdb"), "-D", str(data), "-U", "fleetmap", "-A", "trust", "-E", "UTF8", "--no-sync")
+        if made.returncode:
+            pytest.fail(f"initdb failed: {made.stderr}")
+        started = None
+        port = 0
+        for _ in range(5):
+            port = _free_port()
+            options = (
+                f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories='{home}' -c max_connections=80"
+            )
+            started = run(
+                str(folder / "pg_ctl"),
+                "-D",
+                str(data),
+                "-w",
+                "-t",
+                "60",
+                "-l",
+                str(home / "log"),
+                "-o",
+                options,
+                "start",
+            )
+            if started.returncode == 0:
+                break
+        assert started is not None
+        if started.returncode:
+            log = (home / "log").read_text(errors="replace") if (home / "log").exists() else ""
+            pytest.fail(f"PostgreSQL does not start: {started.stdout}{started.stderr}{log}")
+        try:
+            cluster = Cluster(port, folder, data)
+            with cluster.connect() as connection:
+                known = connection.execute("SELECT 1 FROM pg_available_extensions WHERE name = 'postgis'").fetchone()
+                if known is None:
+                    _missing("PostGIS is not installed beside PostgreSQL")
+                connection.execute("CREATE DATABASE fleetmap_template")
+            with cluster.connect("fleetmap_template") as connection:
+                connection.execute("CREATE EXTENSION postgis")
+            yield cluster
+        finally:
+            run(str(folder / "pg_ctl"), "-D", str(data), "-m", "immediate", "-w", "stop")
+    finally:
+        shutil.rmtree(root, ignore_errors=True)
+
+
+@pytest.fixture
+def postgres_url(postgres_cluster: Cluster) -> Iterator[str]:
+    """A database of its own, removed after the test."""
+    name = postgres_cluster.create_database()
+    yield postgres_cluster.url(name)
+    postgres_cluster.drop_database(name)

@@ -1,0 +1,83 @@
+"""Migrations make exactly what the models say, on both databases."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+from alembic.autogenerate import compare_metadata
+from alembic.runtime.migration import MigrationContext
+
+from app.errors import Unavailable
+from app.store import Store
+from app.store.database import Database
+from app.store.schema import comparison
+from app.store.tables import metadata
+
+
+def test_models_and_migrations_do_not_differ(store: Store, database_url: str):
+    database = Database(database_url, readonly=False)
+    with database.engine.connect() as connection:
+        context = MigrationContext.configure(connection, opts=comparison(connection.dialect.name))
+        assert compare_metadata(context, metadata) == []
+    database.close()
+
+
+def test_the_comparison_sees_a_missing_column(store: Store, database_url: str):
+    database = Database(database_url, readonly=False)
+    with database.write() as connection:
+        connection.exec_driver_sql("ALTER TABLE job DROP COLUMN detail")
+    with database.engine.connect() as connection:
+        differences = compare_metadata(MigrationContext.configure(connection), metadata)
+    database.close()
+    assert any(d[0] == "add_column" and d[3].name == "detail" for d in differences if isinstance(d, tuple))
+
+
+def test_migrating_again_changes_nothing_and_check_passes(store: Store):
+    store.migrate()
+    store.check()
+
+
+def test_check_fails_before_migration(database_url: str, tmp_path: Path):
+    store = Store(database_url, tmp_path / "b")
+    with pytest.raises(Unavailable, match="fleetmap migrate"):
+        store.check()
+    store.close()
+
+
+def test_no_database_is_unavailable(tmp_path: Path):
+    store = Store("postgresql+psycopg://nobody@127.0.0.1:1/none", tmp_path / "b")
+    with pytest.raises(Unavailable):
+        store.check()
+    with pytest.raises(Unavailable):
+        store.environment("farm")
+    store.close()
+
+
+def test_sqlite_keeps_what_it_acknowledges(sqlite_store: Store):
+    with sqlite_store._database.engine.connect() as connection:
+        pragma = {
+            name: connection.exec_driver_sql(f"PRAGMA {name}").scalar_one()
+            for name in ("journal_mode", "synchronous", "foreign_keys", "busy_timeout")
+        }
+    assert pragma == {"journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "busy_timeout": 5000}
+
+
+@pytest.mark.postgres
+def test_postgres_has_gist_indexes_and_uncompressed_chunks(postgres_url: str, tmp_path: Path):
+    store = Store(postgres_url, tmp_path / "b")
+    store.migrate()
+    with store._database.engine.connect() as connection:
+        methods = connection.execute(
+            sa.text(
+                "SELECT c.relname FROM pg_class c JOIN pg_am a ON a.oid = c.relam WHERE a.amname = 'gist' "
+                "AND c.relname LIKE 'ix\\_%' ORDER BY 1"
+            )
+        ).scalars()
+        assert list(methods) == ["ix_environment_extent", "ix_place_geometry"]
+        storage = connection.execute(
+            sa.text("SELECT attstorage FROM pg_attribute WHERE attrelid = 'chunk'::regclass AND attname = 'data'")
+        ).scalar_one()
+        assert storage in ("e", b"e")
+    store.close()
