@@ -52,12 +52,13 @@ class Hints:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What the environment knows already, and what will be used of the files (None: everything)."""
+    """What the environment knows already, and what will be used of the files (see ``ReadContext``)."""
 
     datum: Datum | None = None
     fence: shapely.Polygon | None = None
     wanted: frozenset[Layer] | None = None
     cells: bool = True
+    whole: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,6 +275,7 @@ def _read_group(group: Group, hints: Hints, known: Known, limits: Limits, bundle
         options=formats.read_options(group.format, _known_options(group, hints)),
         wanted=None if group.format.drawing else known.wanted,
         cells=known.cells,
+        whole=known.whole,
     )
     layers = formats.read(group, context)
     for file in group.files:

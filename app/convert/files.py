@@ -48,7 +48,7 @@ def offline(
     hints = hints or Hints()
     needed: frozenset[Layer] = frozenset().union(*known.needs.one_of)
     wanted = None if "objects" in needed else needed  # whatever can be read can be an object
-    told = bundle.read(unpacked, hints, Known(datum, None, wanted, not known.outlines), limits)
+    told = bundle.read(unpacked, hints, Known(datum, None, wanted, not known.outlines, known.drawing), limits)
     layers = told.layers(datum)
     try:
         way = recipes.chain(known, _stock(layers), write_options, derived=derived)
@@ -56,7 +56,7 @@ def offline(
         if wanted is None:
             raise
         # What the format carries is not in the files: read all they have, to derive it from.
-        told = bundle.read(unpacked, hints, Known(datum, None, None, not known.outlines), limits)
+        told = bundle.read(unpacked, hints, Known(datum, None, None, not known.outlines, known.drawing), limits)
         layers = told.layers(datum)
         way = recipes.chain(known, _stock(layers), write_options, derived=derived)
     kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)

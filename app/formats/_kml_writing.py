@@ -6,7 +6,7 @@ import bisect
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 from urllib.parse import unquote
@@ -36,7 +36,7 @@ from app.formats._kml import (
     quoted,
     spell,
 )
-from app.model.features import Features, Properties
+from app.model.features import Features, Properties, concatenate, unique_ids
 from app.model.frame import GROUND
 from app.model.geodesy import LocalFrame
 from app.model.grid import OccupancyGrid
@@ -91,10 +91,9 @@ def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, tak
     documents: list[_Document] = []
     folders: list[str] = []
     drawn = {i for part in layers.vector("objects").values() for i in part.ids}
-    for key in sorted(layers.parts):
-        part = layers.parts[key]
-        if not isinstance(part, Features):
-            continue
+    parts = _drawn_together(layers)
+    for key in sorted(parts):
+        part = parts[key]
         rest: Features | None = part
         if key.layer == "objects" and key.name == FAMILY:
             kept, rest = _drawings(key, part, frame)
@@ -104,7 +103,9 @@ def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, tak
         if rest is not None:
             folders.append(_folder(key, rest, layers, frame))
     overlays, pictures = _grids(layers, context, with_pictures, taken)
-    ours = "".join([_datum(layers), *folders, *overlays])
+    # A drawing that is all there is comes back as it was: the datum stands beside what is ours, not inside it.
+    datum = [_datum(layers)] if folders or overlays or not documents else []
+    ours = "".join([*datum, *folders, *overlays])
     for layer in ("voxels", "imagery"):
         context.drop(layer, len(layers.of(layer)), "KML has no place for it")
     entry = documents[0].entry if len(documents) == 1 else None
@@ -440,6 +441,32 @@ _PREFIX = re.compile(r"[<\s]/?([\w.-]+):[\w.-]+(?=[\s=>/])")
 _DECLARED = re.compile(r"xmlns:([\w.-]+)=")
 _ROOT = re.compile(r"<((?:[\w.-]+:)?([\w.-]+))((?:\s[^>]*?)?)(/?)>")
 _XMLNS = re.compile(r"""\sxmlns(?::[\w.-]+)?="[^"]*\"""")
+
+
+def _drawn_together(layers: Layers) -> dict[PartKey, Features]:
+    """The vector parts; fences and zones that were drawn in a document stand with the objects of that document."""
+    out = {key: part for key, part in layers.parts.items() if isinstance(part, Features)}
+    for key in sorted(out):
+        part = out[key]
+        if key.layer not in ("location", "zones"):
+            continue
+        said = part.document.get(FAMILY)
+        known = said.get("documents", {}) if isinstance(said, Mapping) else {}
+        drawn = np.array(
+            [isinstance(k := p.get(FAMILY), Mapping) and k.get("document") in known for p in part.properties]
+        )
+        if not drawn.any():
+            continue
+        home = PartKey("objects", key.level, FAMILY)
+        others = [out[home]] if home in out else []
+        moved = part.take(drawn).with_document({FAMILY: said})
+        ids = unique_ids(moved.ids, {i for other in others for i in other.ids})
+        out[home] = concatenate([*others, replace(moved, ids=tuple(ids))])
+        left = {name: value for name, value in part.document.items() if name != FAMILY}
+        out[key] = part.take(~drawn).with_document(left)
+        if drawn.all() and not left:
+            del out[key]
+    return out
 
 
 def _drawings(key: PartKey, part: Features, frame: LocalFrame | None) -> tuple[list[_Document], Features | None]:

@@ -588,7 +588,9 @@ class _Writer:
             if isinstance(said, Mapping):
                 tags, attributes = _texts(said.get("tags")), _texts(said.get("attributes"))
             else:
-                tags, attributes = self.tags(i, properties, ("name",)), NOTHING
+                # A street node that went through another format is called by its id there: that is no name.
+                nameless = own and properties.get("name", i) == i
+                tags, attributes = NOTHING if nameless else self.tags(i, properties, ("name",)), NOTHING
             if geometry.has_z and "ele" not in tags:
                 tags = {**tags, "ele": repr(float(geometry.z))}
             self.nodes[new] = _Node(x, y, tags, attributes)
