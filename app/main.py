@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import fcntl
+import itertools
 import logging
 import os
 import shutil
 import sys
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -211,10 +212,16 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         maps=service,
         access=access,
         work=Work(store, service, settings.job_seconds, count),
-        hot=Hot(settings.memory_cache_bytes, access, metrics, store.generation),
+        hot=Hot(settings.memory_cache_bytes, access, metrics, _generation(store)),
         intake=intake,
         metrics=metrics,
     )
+
+
+def _generation(store: Any) -> Callable[[], int]:
+    count = itertools.count()
+    found: Callable[[], int] = getattr(store, "generation", lambda: next(count))
+    return found
 
 
 def close_services(here: Services) -> None:

@@ -16,7 +16,7 @@ from starlette.responses import Response
 from app.api.access import Viewer
 from app.api.answers import Route, answer
 from app.api.maps import number_of
-from app.api.schemas import DiffOut, EnvironmentPath, told
+from app.api.schemas import VERSION, DiffOut, EnvironmentPath, told
 from app.api.services import Here, Services
 from app.errors import Invalid
 from app.model.features import Features
@@ -30,7 +30,7 @@ router = APIRouter(prefix="/environments/{env}", tags=["versions"], route_class=
 
 Ref = Annotated[
     str | None,
-    Query(pattern=r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62})$", description="Number, channel, or `latest`."),
+    Query(pattern=VERSION, description="Number, channel, or `latest`."),
 ]
 
 SIDE = 1024
@@ -55,7 +55,7 @@ def diff(
         str | None,
         Query(
             alias="from",
-            pattern=r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62})$",
+            pattern=VERSION,
             description="The older one: number, channel, or `latest`. Default: the parent of `to`.",
         ),
     ] = None,

@@ -17,6 +17,8 @@ from app.model.frame import MAX_DATUM_LATITUDE
 NAME = r"^[a-z0-9][a-z0-9_-]{0,62}$"
 CHANNEL = r"^[a-z][a-z0-9_-]{0,62}$"
 
+VERSION = r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62})$"
+
 MAX_TEXT = 20_000
 RESERVED = frozenset({"robots", "server"})
 
@@ -400,7 +402,7 @@ EnvironmentPath = Annotated[
 VersionPath = Annotated[
     str,
     Path(
-        pattern=r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62})$",
+        pattern=VERSION,
         description="Number, channel, or `latest`.",
         examples=["latest"],
     ),

@@ -12,7 +12,7 @@ from app.api.access import Viewer
 from app.api.answers import Route, answer
 from app.api.environments import numbers
 from app.api.maps import number_of
-from app.api.schemas import EnvironmentPath, TransformOut, told
+from app.api.schemas import VERSION, EnvironmentPath, TransformOut, told
 from app.api.services import Here
 from app.errors import Invalid, MissingDatum, Problem
 from app.model.frame import MAX_METRES
@@ -37,9 +37,7 @@ def transform(
         str | None, Query(description="`LAT,LON` in degrees (WGS 84).", examples=["53.2687,-0.5244"])
     ] = None,
     xy: Annotated[str | None, Query(description="`X,Y` in metres of the local frame.")] = None,
-    version: Annotated[
-        str, Query(pattern=r"^([0-9]{1,18}|[a-z][a-z0-9_-]{0,62})$", description="Whose datum is meant.")
-    ] = "latest",
+    version: Annotated[str, Query(pattern=VERSION, description="Whose datum is meant.")] = "latest",
 ) -> Response:
     """Give ``latlon`` or ``xy``; the answer has both. Numbers are rounded to 1e-12 degrees and 1e-9 metres."""
     if (latlon is None) == (xy is None):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Path, Query, Request
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -16,6 +16,7 @@ from app.api.caching import Unsatisfiable, byte_range, content_disposition, none
 from app.api.maps import IN_MEMORY, number_of, streamed
 from app.api.problems import UnsupportedMedia
 from app.api.schemas import (
+    VERSION,
     Cursor,
     EditsBody,
     EnvironmentPath,
@@ -196,8 +197,10 @@ def list_sources(env: EnvironmentPath, v: VersionPath, here: Here, _: Viewer) ->
 )
 def get_source(
     env: EnvironmentPath,
-    v: VersionPath,
-    name: str,
+    v: Annotated[str, Path(pattern=VERSION, description="Number, channel, or `latest`.", examples=["1"])],
+    name: Annotated[
+        str, Path(max_length=1024, description="The file's name, with its folders.", examples=["network.tmap2.yaml"])
+    ],
     request: Request,
     here: Here,
     _: Viewer,

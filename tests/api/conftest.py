@@ -1,0 +1,160 @@
+"""A real server on a loopback port, in a thread of its own: what clients see is what is tested."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import uvicorn
+from fastapi import FastAPI
+
+from app.config import Settings
+from app.main import create_app, server_config
+from tests.api import samples
+
+ADMIN = "administrators-token-for-tests"
+API = "/api/v1"
+
+Files = dict[str, bytes]
+
+
+@dataclass
+class Api:
+    """A running server and a client with one token."""
+
+    url: str
+    app: FastAPI
+    token: str | None = ADMIN
+
+    def __post_init__(self) -> None:
+        headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
+        self.http = httpx.Client(base_url=self.url, headers=headers, timeout=60.0)
+
+    def __call__(self, method: str, path: str, expect: int | None = None, **more: Any) -> httpx.Response:
+        """Send a request; a path that does not start with / lies below the API."""
+        answer = self.http.request(method, path if path.startswith("/") else f"{API}/{path}", **more)
+        if expect is not None:
+            assert answer.status_code == expect, f"{method} {path}: {answer.status_code} {answer.text[:2000]}"
+        return answer
+
+    def get(self, path: str, expect: int | None = 200, **more: Any) -> httpx.Response:
+        return self("GET", path, expect, **more)
+
+    def post(self, path: str, json: Any = None, expect: int | None = 201, **more: Any) -> httpx.Response:
+        return self("POST", path, expect, json=json, **more)
+
+    def upload(
+        self, env: str, files: Files, expect: int | None = 201, headers: Any = None, **fields: str
+    ) -> httpx.Response:
+        return self(
+            "POST", f"environments/{env}/versions", expect, files=parts(files), data=fields, headers=headers or {}
+        )
+
+    def problem(self, method: str, path: str, status: int, **more: Any) -> dict[str, Any]:
+        """A request that must fail: its problem, in the one shape."""
+        return problem(self(method, path, status, **more))
+
+    def as_(self, token: str | None) -> Api:
+        return Api(self.url, self.app, token)
+
+    def token_for(self, role: str, **more: Any) -> Api:
+        """A client with a new token."""
+        return self.as_(self.post("tokens", {"name": f"a {role}", "role": role, **more}).json()["token"])
+
+    def close(self) -> None:
+        self.http.close()
+
+
+def parts(files: Files) -> list[tuple[str, tuple[str, bytes]]]:
+    return [("files", (name, data)) for name, data in files.items()]
+
+
+def problem(answer: httpx.Response) -> dict[str, Any]:
+    """The answer's problem: RFC 9457 with the contract's members and no others."""
+    assert answer.headers["content-type"] == "application/problem+json", answer.text[:500]
+    body: dict[str, Any] = answer.json()
+    assert set(body) <= {"type", "title", "status", "detail", "errors"}, body
+    assert body["status"] == answer.status_code
+    assert body["type"]
+    assert body["title"]
+    assert body["detail"]
+    for item in body.get("errors", ()):
+        assert set(item) <= {"file", "line", "where", "problem"}, item
+        assert item["problem"]
+    assert "Traceback" not in answer.text
+    assert "site-packages" not in answer.text
+    return body
+
+
+@contextmanager
+def running(settings: Settings) -> Iterator[Api]:
+    """A server with these settings until the block ends."""
+    app = create_app(settings)
+    server = uvicorn.Server(server_config(settings, app, port=0))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        deadline = time.monotonic() + 60
+        while not server.started:
+            assert thread.is_alive(), "the server did not start"
+            assert time.monotonic() < deadline, "the server did not start in time"
+            time.sleep(0.01)
+        port = server.servers[0].sockets[0].getsockname()[1]
+        api = Api(f"http://127.0.0.1:{port}", app)
+        try:
+            yield api
+        finally:
+            api.close()
+    finally:
+        server.should_exit = True
+        thread.join(30)
+        assert not thread.is_alive(), "the server did not stop"
+
+
+def settings_for(folder: Path, **more: Any) -> Settings:
+    """Settings that read nothing of the environment of whoever runs the tests."""
+    values = {"admin_token": ADMIN, "conversion_workers": 1, "max_memory_bytes": 4 * 2**30, "log_level": "warning"}
+    return Settings(_env_file=None, data_dir=folder, **{**values, **more})  # type: ignore[call-arg]
+
+
+@pytest.fixture(scope="session")
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
+    """The server that most tests share; each uses environments of its own."""
+    with running(settings_for(tmp_path_factory.mktemp("server"))) as api:
+        yield api
+
+
+_count = itertools.count(1)
+
+
+@pytest.fixture
+def fresh() -> Callable[[], str]:
+    """A name that no environment has."""
+    return lambda: f"env-{next(_count)}"
+
+
+@pytest.fixture
+def farm(api: Api, fresh: Callable[[], str]) -> str:
+    """An environment with a datum (version 1), a network (2) and a grid (3)."""
+    name = fresh()
+    api.post("environments", {"name": name, "title": "Farm", "tags": ["wheat"]})
+    api.upload(name, {"datum.yaml": samples.DATUM}, message="measured")
+    api.upload(name, {"network.tmap2.yaml": samples.tmap2()}, message="driven")
+    api.upload(name, samples.grid(), message="mapped")
+    return name
+
+
+@pytest.fixture
+def bare(api: Api, fresh: Callable[[], str]) -> str:
+    """An environment with nothing in it."""
+    name = fresh()
+    api.post("environments", {"name": name})
+    return name

@@ -1,0 +1,167 @@
+"""Tokens, roles and the brake on guessing, without a server."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from app.api.access import FRESH_SECONDS, WINDOW_SECONDS, Access, Principal, environment_of, is_open, source_of
+from app.api.problems import Throttled
+from app.errors import Denied, Unauthenticated
+from app.store.values import Role, Token
+
+NOW = datetime.now(UTC)
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.time = 1000.0
+
+    def __call__(self) -> float:
+        return self.time
+
+
+class Book:
+    """A store's tokens, counting how often it is asked."""
+
+    def __init__(self, **tokens: Token) -> None:
+        self.tokens, self.asked = tokens, 0
+
+    def __call__(self, text: str) -> Token | None:
+        self.asked += 1
+        return self.tokens.get(text)
+
+
+def token(role: Role = "viewer", environments: str | None = None, expires: datetime | None = None) -> Token:
+    return Token("t1", "somebody", role, environments, None, expires, NOW)
+
+
+def test_a_token_is_asked_for_once_a_second() -> None:
+    clock, book = Clock(), Book(good=token())
+    access = Access(book, failures=3, clock=clock)
+    header = b"Bearer good"
+    assert access.known(header) is None
+    assert access.check(header, "10.0.0.1").name == "somebody"
+    assert access.known(header) is not None
+    access.check(header, "10.0.0.1")
+    assert book.asked == 1
+    clock.time += FRESH_SECONDS + 0.01
+    assert access.known(header) is None
+    book.tokens.clear()
+    with pytest.raises(Unauthenticated):
+        access.check(header, "10.0.0.1")
+
+
+def test_a_revoked_token_is_forgotten_at_once() -> None:
+    book = Book(good=token())
+    access = Access(book, failures=3, clock=Clock())
+    access.check(b"Bearer good", None)
+    access.forget()
+    assert access.known(b"Bearer good") is None
+
+
+@pytest.mark.parametrize(
+    "header", [None, b"", b"Bearer", b"Bearer ", b"Basic good", b"good", b"Bearer \xff", b"Bearer " + b"x" * 999]
+)
+def test_without_a_usable_token(header: bytes | None) -> None:
+    book = Book(good=token())
+    with pytest.raises(Unauthenticated):
+        Access(book, failures=3, clock=Clock()).check(header, None)
+    assert book.asked == 0
+
+
+def test_the_scheme_is_not_case_sensitive() -> None:
+    assert Access(Book(good=token()), failures=3).check(b"bearer good", None).id == "t1"
+
+
+def test_expired() -> None:
+    access = Access(Book(old=token(expires=NOW - timedelta(seconds=1))), failures=3)
+    with pytest.raises(Unauthenticated):
+        access.check(b"Bearer old", None)
+
+
+def test_guessing_is_slowed_for_its_source_alone() -> None:
+    clock, book = Clock(), Book(good=token())
+    access = Access(book, failures=3, clock=clock)
+    access.check(b"Bearer good", "10.0.0.1")
+    for _ in range(3):
+        with pytest.raises(Unauthenticated):
+            access.check(b"Bearer wrong", "10.0.0.1")
+    asked = book.asked
+    with pytest.raises(Throttled):
+        access.check(b"Bearer wrong", "10.0.0.1")
+    assert book.asked == asked
+    assert access.check(b"Bearer good", "10.0.0.1"), "a token that was good a moment ago stays good"
+    assert access.check(b"Bearer good", "10.0.0.2")
+    with pytest.raises(Unauthenticated):
+        access.check(b"Bearer wrong", "10.0.0.2")
+    clock.time += WINDOW_SECONDS + 1
+    with pytest.raises(Unauthenticated):
+        access.check(b"Bearer wrong", "10.0.0.1")
+
+
+def test_asking_without_a_token_is_no_failure() -> None:
+    access = Access(Book(good=token()), failures=1, clock=Clock())
+    for _ in range(5):
+        with pytest.raises(Unauthenticated):
+            access.check(None, "10.0.0.1")
+    assert access.check(b"Bearer good", "10.0.0.1")
+
+
+def test_sources() -> None:
+    assert source_of("10.0.0.1") == "10.0.0.1"
+    assert source_of("2001:db8::1") == source_of("2001:db8::2") != source_of("2001:db9::1")
+    assert source_of(None) == ""
+    assert source_of("testclient") == "testclient"
+
+
+@pytest.mark.parametrize(
+    ("role", "may"),
+    [
+        ("viewer", {"viewer"}),
+        ("robot", {"viewer"}),
+        ("editor", {"viewer", "editor"}),
+        ("admin", {"viewer", "editor", "admin"}),
+    ],
+)
+def test_roles(role: Role, may: set[str]) -> None:
+    principal = Principal.of(token(role))
+    for need in ("viewer", "editor", "admin"):
+        if need in may:
+            principal.demand(need)  # type: ignore[arg-type]
+        else:
+            with pytest.raises(Denied):
+                principal.demand(need)  # type: ignore[arg-type]
+
+
+def test_environments_by_pattern() -> None:
+    principal = Principal.of(token(environments="farm-*"))
+    principal.enter("farm-1")
+    for other in ("farm", "xfarm-1", "street"):
+        with pytest.raises(Denied):
+            principal.enter(other)
+    with pytest.raises(Denied):
+        principal.demand_everywhere()
+    Principal.of(token()).enter("anything")
+
+
+@pytest.mark.parametrize(
+    ("path", "environment"),
+    [
+        ("/api/v1/environments", None),
+        ("/api/v1/environments/", None),
+        ("/api/v1/environments/farm", "farm"),
+        ("/api/v1/environments/farm/versions/1/maps/kml", "farm"),
+        ("/api/v1/environments/fa\nrm/x", "fa\nrm"),
+        ("/maps/farm/kml", "farm"),
+        ("/api/v1/formats", None),
+    ],
+)
+def test_the_environment_of_an_address(path: str, environment: str | None) -> None:
+    assert environment_of(path) == environment
+
+
+def test_open_addresses() -> None:
+    assert all(map(is_open, ("/healthz", "/readyz", "/docs", "/docs/swagger-ui.css", "/openapi.json")))
+    assert not any(map(is_open, ("/", "/metrics", "/docsx", "/healthz/", "/api/v1/formats", "/maps/a/b")))

@@ -1,0 +1,333 @@
+"""Maps as robots fetch them: whole, by file, by short address, conditionally, in parts; and what they are made of."""
+
+from __future__ import annotations
+
+import io
+import json
+import threading
+import time
+import zipfile
+from pathlib import Path
+from urllib.parse import quote
+
+import pytest
+import yaml
+
+from tests.api import samples
+from tests.api.conftest import Api, problem, running, settings_for
+
+
+def test_a_single_file_map(api: Api, farm: str) -> None:
+    answer = api.get(f"environments/{farm}/versions/3/maps/tmap2")
+    assert {n["node"]["name"] for n in yaml.safe_load(answer.content)["nodes"]} == set(samples.NODES)
+    headers = answer.headers
+    assert headers["content-disposition"] == 'attachment; filename="network.tmap2.yaml"'
+    assert headers["cache-control"] == "no-cache"
+    assert headers["accept-ranges"] == "bytes"
+    assert headers["fleetmap-version"] == "3"
+    assert headers["fleetmap-root"] == api.get(f"environments/{farm}/versions/3").json()["root"]
+    assert headers["content-length"] == str(len(answer.content))
+    assert headers["x-content-type-options"] == "nosniff"
+    assert headers["etag"].startswith('"')
+    link = answer.links["describedby"]["url"]
+    assert link == f"/api/v1/environments/{farm}/versions/3/reports/tmap2"
+    report = api.get(link).json()
+    assert (report["format"], report["version"]) == ("tmap2", 3)
+    assert {"layers", "template", "dropped", "warnings"} <= set(report)
+    (topology,) = [line for line in report["layers"] if line["layer"] == "topology"]
+    assert topology["information"] == "raw"
+    assert topology["sources"] == ["network.tmap2.yaml"]
+    assert "occupancy" in {line["what"] for line in report["dropped"]}
+
+
+def test_a_map_of_several_files(api: Api, farm: str) -> None:
+    base = f"environments/{farm}/versions/latest/maps/occupancy_grid"
+    answer = api.get(base)
+    assert answer.headers["content-type"] == "application/zip"
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert sorted(archive.namelist()) == ["map.pgm", "map.yaml"]
+        for name in archive.namelist():
+            single = api.get(f"{base}/{name}")
+            assert single.content == archive.read(name)
+            assert single.headers["etag"] != answer.headers["etag"]
+    problem_ = api.problem("GET", f"{base}/other.yaml", 404)
+    assert "map.yaml" in problem_["detail"]
+    api.problem("GET", f"{base}/{quote('../map.yaml', safe='')}", 404)
+
+
+def test_the_same_again_is_304(api: Api, farm: str) -> None:
+    for path in (
+        f"environments/{farm}/versions/latest/maps/tmap2",
+        f"/maps/{farm}/tmap2",
+        f"/maps/{farm}/occupancy_grid/map.pgm",
+    ):
+        etag = api.get(path).headers["etag"]
+        for tags in (etag, f"W/{etag}", f'"x", {etag}', "*"):
+            again = api.get(path, 304, headers={"If-None-Match": tags})
+            assert again.content == b""
+            assert again.headers["etag"] == etag
+            assert again.headers["fleetmap-version"] == "3"
+        assert api.get(path, headers={"If-None-Match": '"other"'}).content
+
+
+def test_304_without_making(api: Api, farm: str) -> None:
+    """A robot that has the map already costs no conversion, also after a restart of the server."""
+    path = f"environments/{farm}/versions/3/maps/kml"
+    etag = api.get(path).headers["etag"]
+    hot = api.app.state.services.hot
+    hot._entries.clear()
+    api.get(path, 304, headers={"If-None-Match": etag})
+    api.get(path, 304, headers={"If-None-Match": etag})
+    assert api.get(path).headers["etag"] == etag
+
+
+def test_head(api: Api, farm: str) -> None:
+    path = f"/maps/{farm}/tmap2"
+    for _ in range(2):
+        answer = api("HEAD", path, 200)
+        assert answer.content == b""
+        assert answer.headers["content-length"] == str(len(api.get(path).content))
+    etag = answer.headers["etag"]
+    assert api("HEAD", path, 304, headers={"If-None-Match": etag}).content == b""
+    assert api("HEAD", f"environments/{farm}", 200).content == b""
+    assert api("HEAD", "environments/nowhere", 404).content == b""
+
+
+def test_ranges(api: Api, farm: str) -> None:
+    path = f"/maps/{farm}/tmap2"
+    whole = api.get(path)
+    etag, size = whole.headers["etag"], len(whole.content)
+    part = api.get(path, 206, headers={"Range": "bytes=10-19"})
+    assert part.content == whole.content[10:20]
+    assert part.headers["content-range"] == f"bytes 10-19/{size}"
+    assert part.headers["etag"] == etag
+    assert api.get(path, 206, headers={"Range": "bytes=-7"}).content == whole.content[-7:]
+    assert api.get(path, 206, headers={"Range": "bytes=5-", "If-Range": etag}).content == whole.content[5:]
+    assert api.get(path, 200, headers={"Range": "bytes=5-", "If-Range": '"old"'}).content == whole.content
+    beyond = api.get(path, 416, headers={"Range": f"bytes={size}-"})
+    assert beyond.headers["content-range"] == f"bytes */{size}"
+    problem(beyond)
+    api.get(path, 304, headers={"Range": "bytes=5-", "If-None-Match": etag})
+
+
+def test_the_short_address_follows_production(api: Api, farm: str) -> None:
+    path = f"/maps/{farm}/tmap2"
+    assert api.get(path).headers["fleetmap-version"] == "3"
+    api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
+    assert api.get(path).headers["fleetmap-version"] == "2"
+    api.upload(
+        farm, {"network.tmap2.yaml": samples.tmap2({"gate": (0.0, 0.0), "barn": (11.0, 0.0), "field": (10.0, 8.0)})}
+    )
+    assert api.get(path).headers["fleetmap-version"] == "2"
+    assert api.get(f"environments/{farm}/versions/latest/maps/tmap2").headers["fleetmap-version"] == "4"
+    api("PUT", f"environments/{farm}/channels/production", 200, json={"version": "latest"})
+    assert api.get(path).headers["fleetmap-version"] == "4"
+    assert api.get(f"environments/{farm}/versions/production/maps/tmap2").headers["fleetmap-version"] == "4"
+
+
+def test_an_acknowledged_change_is_seen_at_once(api: Api, farm: str) -> None:
+    path = f"/maps/{farm}/tmap2"
+    for k in range(5):
+        assert api.get(path).headers["fleetmap-version"] == str(3 + k)
+        nodes = {**samples.NODES, "field": (10.0, 8.5 + k)}
+        api.upload(farm, {"network.tmap2.yaml": samples.tmap2(nodes)})
+        answer = api.get(path)
+        assert answer.headers["fleetmap-version"] == str(4 + k)
+        places = {
+            n["node"]["name"]: n["node"]["pose"]["position"]["y"] for n in yaml.safe_load(answer.content)["nodes"]
+        }
+        assert places["field"] == 8.5 + k
+
+
+def test_other_layers_do_not_change_a_map(api: Api, farm: str) -> None:
+    """The ETag says what the bytes depend on, so a robot fetches nothing when only the grid has changed."""
+    before = api.get(f"/maps/{farm}/tmap2")
+    api.upload(farm, samples.grid(width=9))
+    after = api.get(f"/maps/{farm}/tmap2")
+    assert after.headers["etag"] == before.headers["etag"]
+    assert after.headers["fleetmap-version"] == "4"
+    assert after.headers["fleetmap-root"] != before.headers["fleetmap-root"]
+
+
+def test_parameters_of_a_format(api: Api, farm: str) -> None:
+    base = f"environments/{farm}/versions/3/maps/occupancy_grid"
+    with zipfile.ZipFile(io.BytesIO(api.get(f"{base}?file_type=png").content)) as archive:
+        assert sorted(archive.namelist()) == ["map.png", "map.yaml"]
+    body = api.problem("GET", f"{base}?file_type=bmp", 422)
+    assert body["errors"][0]["where"] == "file_type"
+    api.problem("GET", f"{base}?colour=red", 422)
+    api.problem("GET", f"{base}?derive=perhaps", 422)
+    api.problem("GET", f"{base}?file_type=png&file_type=pgm", 422)
+    api.problem("GET", f"{base}?grid=other", 404)
+    link = api.get(f"{base}?file_type=png").links["describedby"]["url"]
+    assert link.endswith("/reports/occupancy_grid?file_type=png")
+    assert api.get(link).json()["format"] == "occupancy_grid"
+
+
+def test_what_cannot_be_made(api: Api, bare: str) -> None:
+    base = f"environments/{bare}/versions/latest/maps"
+    assert "supply" in api.problem("GET", f"{base}/tmap2", 422)["detail"]
+    api.problem("GET", f"{base}/datum", 422)
+    api.problem("GET", f"{base}/nosuch", 404)
+    api.problem("GET", f"/maps/{bare}/nosuch", 404)
+    api.problem("GET", f"/maps/{bare}", 404)
+    api.problem("POST", f"/maps/{bare}/kml", 405, json={})
+    api.problem("GET", f"environments/{bare}/versions/9/maps/kml", 404)
+
+
+def test_derived_only_where_it_is_allowed(api: Api, bare: str) -> None:
+    api.upload(bare, {"drawing.kml": samples.KML})
+    base = f"environments/{bare}/versions/1"
+    coverage = {line["format"]: line for line in api.get(f"{base}/maps").json()}
+    assert coverage["tmap2"]["state"] == "derivable"
+    (step,) = coverage["tmap2"]["chain"]
+    assert (step["from"], step["to"]) == (["objects"], "topology")
+    assert {"step", "from", "to", "parameters"} <= set(step)
+    answer = api.get(f"{base}/maps/tmap2")
+    assert len(yaml.safe_load(answer.content)["nodes"]) == 3
+    report = api.get(answer.links["describedby"]["url"]).json()
+    assert [line["information"] for line in report["layers"] if line["layer"] == "topology"] == ["derived"]
+    api.problem("GET", f"{base}/maps/tmap2?derive=false", 422)
+    api.problem("GET", f"{base}/reports/tmap2?derive=false", 422)
+
+
+def test_coverage(api: Api, farm: str) -> None:
+    lines = {line["format"]: line for line in api.get(f"environments/{farm}/versions/3/maps").json()}
+    assert all(set(line) == {"format", "state", "chain", "missing"} for line in lines.values())
+    assert lines["tmap2"]["state"] == "direct"
+    assert lines["osm"]["state"] in ("direct", "derivable")
+    for name, line in lines.items():
+        answer = api.get(f"environments/{farm}/versions/3/maps/{name}", None)
+        assert answer.status_code == (422 if line["state"] == "missing" else 200), (name, answer.text[:300])
+        assert bool(line["missing"]) == (line["state"] == "missing")
+
+
+def test_formats_through_each_other(api: Api, farm: str) -> None:
+    made = json.loads(api.get(f"/maps/{farm}/geojson").content) if "geojson" in _formats(api) else None
+    if made is not None:
+        kinds = [f["properties"].get("kind") for f in made["features"]]
+        assert kinds.count("node") == 3
+        assert kinds.count("edge") == 3
+    kml = api.get(f"/maps/{farm}/kml").content
+    assert all(name.encode() in kml for name in samples.NODES)
+
+
+def _formats(api: Api) -> set[str]:
+    return {f["id"] for f in api.get("formats").json()}
+
+
+def test_a_fleet_asks_at_once(api: Api, farm: str) -> None:
+    """One conversion, and everybody gets the same bytes."""
+    path = f"{api.url}/maps/{farm}/kml"
+    count = api.app.state.services.metrics.conversions.labels("kml", "made")._value.get
+    before, answers = count(), []
+
+    def ask() -> None:
+        answers.append(api.as_(api.token).http.get(path))
+
+    threads = [threading.Thread(target=ask) for _ in range(12)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert {a.status_code for a in answers} == {200}
+    assert len({a.content for a in answers}) == 1
+    assert count() - before == 1
+
+
+def test_a_large_file_is_streamed_from_disk(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from app.api import maps
+
+    small = api.get(f"/maps/{farm}/tmap2")
+    monkeypatch.setattr(maps, "IN_MEMORY", 100)
+    monkeypatch.setattr(maps, "CHUNK", 1000)
+    api.app.state.services.hot._entries.clear()
+    for _ in range(2):
+        large = api.get(f"/maps/{farm}/tmap2")
+        assert large.content == small.content
+        assert large.headers["etag"] == small.headers["etag"]
+        assert large.headers["content-length"] == str(len(small.content))
+    part = api.get(f"/maps/{farm}/tmap2", 206, headers={"Range": "bytes=10-2999"})
+    assert part.content == small.content[10:3000]
+    api.get(f"/maps/{farm}/tmap2", 416, headers={"Range": "bytes=9999999-"})
+    api.get(f"/maps/{farm}/tmap2", 304, headers={"If-None-Match": small.headers["etag"]})
+    head = api("HEAD", f"/maps/{farm}/tmap2", 200)
+    assert head.headers["content-length"] == str(len(small.content))
+    assert api.get(f"environments/{farm}/versions/2/sources/network.tmap2.yaml").content == samples.tmap2()
+    api.app.state.services.hot._entries.clear()
+
+
+def test_memory_is_bounded(tmp_path: Path) -> None:
+    with running(settings_for(tmp_path, memory_cache_bytes=10_000)) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2(), **samples.grid()})
+        hot = api.app.state.services.hot
+        for _ in range(2):
+            for name in ("tmap2", "kml", "datum", "occupancy_grid", "kmz"):
+                api.get(f"/maps/farm/{name}")
+                assert hot._size <= 10_000 or len(hot._entries) == 1
+
+
+def test_work_that_takes_long_becomes_a_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from app.convert import Maps
+
+    quick, gate = Maps.make, threading.Event()
+
+    def slow(self: Maps, recipe: object) -> object:
+        assert gate.wait(30)
+        return quick(self, recipe)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Maps, "make", slow)
+    with running(settings_for(tmp_path, job_seconds=0.2)) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
+        answer = api.get("/maps/farm/tmap2?", 202)
+        where = answer.headers["location"]
+        job = answer.json()
+        assert where == f"/api/v1/jobs/{job['id']}"
+        assert job["state"] == "running"
+        assert api.get("/maps/farm/tmap2", 202).headers["location"] == where, "one job for one who asks again"
+        assert api.get(where).json()["state"] == "running"
+        other = api.token_for("viewer")
+        api_other = other.get("/maps/farm/tmap2", 202).headers["location"]
+        assert api_other != where
+        other.problem("GET", where, 403)
+        gate.set()
+        deadline = time.monotonic() + 30
+        while (job := api.get(where).json())["state"] == "running":
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        assert (job["state"], job["progress"]) == ("done", 1.0)
+        assert api.get(job["result"]["location"]).content == api.get("/maps/farm/tmap2").content
+        api("DELETE", where, 204)
+        api.problem("GET", where, 404)
+
+
+def test_a_job_is_cancelled_or_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from app.convert import Maps
+    from app.errors import CannotConvert
+
+    gate = threading.Event()
+
+    def broken(self: Maps, recipe: object) -> object:
+        assert gate.wait(30)
+        raise CannotConvert("it cannot be done")
+
+    monkeypatch.setattr(Maps, "make", broken)
+    with running(settings_for(tmp_path, job_seconds=0.1)) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", {"n.tmap2.yaml": samples.tmap2(), "datum.yaml": samples.DATUM})
+        cancelled = api.get("/maps/farm/tmap2", 202).headers["location"]
+        failing = api.get("/maps/farm/kml", 202).headers["location"]
+        api("DELETE", cancelled, 204)
+        assert api.get(cancelled).json()["state"] == "cancelled"
+        gate.set()
+        deadline = time.monotonic() + 30
+        while (job := api.get(failing).json())["state"] == "running":
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        assert job["state"] == "failed"
+        assert job["problem"]["status"] == 422
+        assert job["problem"]["detail"] == "it cannot be done"
+        assert api.get(cancelled).json()["state"] == "cancelled"
+        api.problem("GET", "/maps/farm/tmap2", 422)

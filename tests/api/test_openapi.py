@@ -1,0 +1,183 @@
+"""OpenAPI: complete, and every example in it works against a server."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.api.openapi import unguarded
+from tests.api import samples
+from tests.api.conftest import Api, parts, running, settings_for
+
+UPLOADED = {"datum.yaml": samples.DATUM}
+"""Files that the examples of uploads name."""
+
+
+@pytest.fixture(scope="module")
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
+    """A server that holds what the examples speak of: the environment farm with a network, and more."""
+    with running(settings_for(tmp_path_factory.mktemp("examples"), job_seconds=60)) as api:
+        api.post("environments", {"name": "farm", "title": "The farm"})
+        files = {"network.tmap2.yaml": samples.tmap2(), "datum.yaml": samples.DATUM, **samples.grid()}
+        api.upload("farm", files)
+        yield api
+
+
+@pytest.fixture(scope="module")
+def schema(api: Api) -> dict[str, Any]:
+    body: dict[str, Any] = api.as_(None).get("/openapi.json").json()
+    return body
+
+
+def operations(schema: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
+    return [(path, method, op) for path, item in schema["paths"].items() for method, op in item.items()]
+
+
+def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
+    e, v = "/api/v1/environments/{env}", "/api/v1/environments/{env}/versions/{v}"
+    wanted = {
+        "/healthz": "get", "/readyz": "get", "/metrics": "get", "/api/v1/formats": "get",
+        "/api/v1/environments": "get post", e: "get patch delete", f"{e}/restore": "post", f"{e}/purge": "post",
+        f"{e}/versions": "get post", v: "get", f"{v}/sources": "get", f"{v}/sources/{{name}}": "get",
+        f"{v}/layers": "get", f"{v}/layers/{{layer}}": "get", f"{e}/edits": "post", f"{v}/maps": "get",
+        f"{v}/maps/{{format}}": "get", f"{v}/maps/{{format}}/{{file}}": "get", f"{v}/reports/{{format}}": "get",
+        f"{e}/diff": "get", f"{e}/channels": "get", f"{e}/channels/{{channel}}": "put",
+        f"{e}/channels/{{channel}}/planned": "delete", f"{e}/transform": "get", "/api/v1/convert": "post",
+        "/api/v1/jobs/{id}": "get delete", "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete",
+        "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
+    }  # fmt: skip
+    assert {path: " ".join(sorted(item, key=["get", "post", "put", "patch", "delete"].index))
+            for path, item in schema["paths"].items()} == wanted  # fmt: skip
+
+
+def test_every_call_is_described(schema: dict[str, Any]) -> None:
+    seen = set()
+    for path, method, op in operations(schema):
+        where = f"{method} {path}"
+        assert op.get("summary"), where
+        assert op.get("description"), where
+        assert op["operationId"] not in seen, where
+        seen.add(op["operationId"])
+        for parameter in op.get("parameters", ()):
+            assert parameter.get("description") or parameter["schema"].get("description"), (where, parameter["name"])
+        assert ("security" in op) == (path not in ("/healthz", "/readyz")), where
+
+
+def test_every_problem_is_documented_in_its_shape(schema: dict[str, Any]) -> None:
+    for path, method, op in operations(schema):
+        for status, response in op["responses"].items():
+            if int(status) < 400:
+                continue
+            content = response["content"]
+            assert list(content) == ["application/problem+json"], (method, path, status)
+            assert content["application/problem+json"]["schema"] == {"$ref": "#/components/schemas/Problem"}
+        if "security" in op:
+            assert {"401", "403", "422", "429", "503"} <= set(op["responses"]), (method, path)
+        if "requestBody" in op:
+            assert {"400", "413", "415"} <= set(op["responses"]), (method, path)
+
+
+def test_references_resolve(schema: dict[str, Any]) -> None:
+    known = set(schema["components"]["schemas"])
+    used = set(re.findall(r"#/components/schemas/([A-Za-z_0-9]+)", str(schema)))
+    assert used <= known
+    assert "HTTPValidationError" not in known
+
+
+def test_parameters_of_formats_are_listed(api: Api, schema: dict[str, Any]) -> None:
+    op = schema["paths"]["/api/v1/environments/{env}/versions/{v}/maps/{format}"]["get"]
+    listed = {p["name"] for p in op["parameters"] if p["in"] == "query"}
+    declared = {o["name"] for f in api.get("formats").json() if f["write"] for o in f["options"] if o["for"] == "write"}
+    assert listed == declared | {"derive"}
+
+
+def test_every_route_asks_for_a_role(api: Api) -> None:
+    assert unguarded(api.app) == []
+
+
+def test_the_page_needs_no_network(api: Api) -> None:
+    nobody = api.as_(None)
+    page = nobody.get("/docs").text
+    links = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert len(links) >= 3
+    for link in links:
+        assert link.startswith("/docs/"), link
+        assert nobody.get(link).content
+    assert "//" not in page.replace("</", "").replace("<!--", "").replace("/*", "") or "http" not in page
+
+
+# --- the examples work ---
+
+ORDER = ["post", "get", "put", "patch", "delete"]
+LAST = ("delete_environment", "restore_environment", "purge_environment")
+
+
+def example_of(parameter: dict[str, Any]) -> Any:
+    if "example" in parameter:
+        return parameter["example"]
+    for place in (parameter, parameter.get("schema", {})):
+        if place.get("examples"):
+            found = place["examples"]
+            return found[0] if isinstance(found, list) else next(iter(found.values()))["value"]
+    return None
+
+
+def bodies_of(schema: dict[str, Any], op: dict[str, Any]) -> list[dict[str, Any]]:
+    """Ways to send the examples of a call, as arguments for the client."""
+    content = op.get("requestBody", {}).get("content", {})
+    out: list[dict[str, Any]] = []
+    for media, told in content.items():
+        examples = [e["value"] for e in told.get("examples", {}).values()]
+        reference = told["schema"].get("$ref", "").rpartition("/")[2]
+        examples += schema["components"]["schemas"].get(reference, {}).get("examples", [])
+        assert examples, f"{op['operationId']} has no example for {media}"
+        for value in examples:
+            if media == "multipart/form-data":
+                files = {name: UPLOADED[name] for name in value["files"]}
+                data = {k: v for k, v in value.items() if k != "files"}
+                out.append({"files": parts(files), "data": data})
+            else:
+                out.append({"json": value})
+    return out or [{}]
+
+
+def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -> None:
+    known: dict[str, str] = {}
+    job = api.app.state.services.store.create_job(owner="", detail="an example")
+    known["/api/v1/jobs/{id}"] = job.id
+    found = operations(schema)
+    found.sort(key=lambda o: (LAST.index(_name(o)) if _name(o) in LAST else -1, ORDER.index(o[1])))
+    ran = 0
+    for path, method, op in found:
+        where = f"{method} {path}"
+        if path == "/api/v1/environments/{env}/channels/{channel}/planned":
+            body = {"version": 1, "activate_at": "2099-01-01T00:00:00Z"}
+            api("PUT", "environments/farm/channels/production", 200, json=body)
+        if _name((path, method, op)) == "purge_environment":
+            api("DELETE", "environments/farm", 204)
+        query: dict[str, Any] = {}
+        target = path
+        for parameter in op.get("parameters", ()):
+            value = example_of(parameter)
+            if parameter["in"] == "path":
+                value = value if value is not None else known.get(path)
+                assert value is not None, (where, parameter["name"])
+                target = target.replace("{" + parameter["name"] + "}", str(value))
+            elif parameter["in"] == "query" and value is not None:
+                query[parameter["name"]] = value
+        for body in bodies_of(schema, op):
+            answer = api(method.upper(), target, None, params=query, **body)
+            assert answer.status_code < 400, (where, answer.status_code, answer.text[:1000])
+            assert str(answer.status_code) in op["responses"], (where, answer.status_code)
+            if path == "/api/v1/tokens" and method == "post":
+                known["/api/v1/tokens/{id}"] = answer.json()["id"]
+            ran += 1
+    assert ran >= len(found)
+
+
+def _name(operation: tuple[str, str, dict[str, Any]]) -> str:
+    return re.sub(r"_api_v1_.*", "", operation[2]["operationId"])

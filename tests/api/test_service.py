@@ -1,0 +1,459 @@
+"""Channels, formats, conversion, tokens and roles, health and metrics, and the shape of every error."""
+
+from __future__ import annotations
+
+import io
+import re
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.api import samples
+from tests.api.conftest import ADMIN, API, Api, parts, problem, running, settings_for
+
+# --- channels ---
+
+
+def test_channels(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/channels"
+    (latest,) = api.get(url).json()
+    assert (latest["channel"], latest["version"]) == ("latest", 3)
+    moved = api("PUT", f"{url}/production", 200, json={"version": 2}).json()
+    assert (moved["channel"], moved["version"], moved["author"]) == ("production", 2, "administrator")
+    assert moved["root"] == api.get(f"environments/{farm}/versions/2").json()["root"]
+    assert [c["channel"] for c in api.get(url).json()] == ["latest", "production"]
+    assert api.get(f"environments/{farm}/versions/production").json()["version"] == 2
+    back = api("PUT", f"{url}/production", 200, json={"version": 1}).json()
+    assert back["sequence"] > moved["sequence"]
+    assert api("PUT", f"{url}/staging", 200, json={"version": "production"}).json()["version"] == 1
+    for body in ({}, {"version": -1}, {"version": 1, "x": 1}, {"version": None}):
+        answer = api("PUT", f"{url}/production", None, json=body)
+        assert answer.status_code in (404, 422)
+        problem(answer)
+    api.problem("PUT", f"{url}/production", 404, json={"version": 99})
+    api.problem("PUT", f"{url}/latest", 422, json={"version": 1})
+    api.problem("PUT", f"{url}/Bad", 422, json={"version": 1})
+
+
+def test_planned_moves(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/channels"
+    api("PUT", f"{url}/production", 200, json={"version": 1})
+    later = (datetime.now(UTC) + timedelta(hours=1)).isoformat()
+    planned = api("PUT", f"{url}/production", 200, json={"version": 2, "activate_at": later}).json()
+    assert planned["version"] == 1
+    assert planned["planned"]["version"] == 2
+    api("DELETE", f"{url}/production/planned", 204)
+    assert api.get(url).json()[1]["planned"] is None
+    api.problem("DELETE", f"{url}/production/planned", 404)
+    for bad in ("2020-01-01T00:00:00Z", "2099-01-01T00:00:00", "tomorrow"):
+        api.problem("PUT", f"{url}/production", 422, json={"version": 2, "activate_at": bad})
+    soon = (datetime.now(UTC) + timedelta(seconds=0.5)).isoformat()
+    api("PUT", f"{url}/production", 200, json={"version": 3, "activate_at": soon})
+    deadline = time.monotonic() + 15
+    while api.get(f"/maps/{farm}/tmap2").headers["fleetmap-version"] != "3":
+        assert time.monotonic() < deadline, "the planned move did not come"
+        time.sleep(0.1)
+
+
+# --- formats and conversion ---
+
+
+def test_formats(api: Api) -> None:
+    known = {f["id"]: f for f in api.get("formats").json()}
+    assert {"datum", "osm", "kml", "kmz", "occupancy_grid", "tmap2", "geojson"} <= set(known)
+    grid = known["occupancy_grid"]
+    assert set(grid) == {"id", "title", "files", "media_types", "read", "write", "options", "information"}
+    assert set(grid["information"]) == {
+        "location", "objects", "topology", "occupancy", "voxels", "imagery", "zones",
+    }  # fmt: skip
+    assert grid["information"]["occupancy"] == "raw"
+    assert grid["information"]["voxels"] == "-"
+    assert known["kml"]["information"]["topology"] in ("raw", "derived")
+    option = next(o for o in grid["options"] if o["name"] == "file_type")
+    assert option["schema"]["enum"] == ["pgm", "png"]
+    assert option["default"] == "pgm"
+    assert option["description"]
+
+
+def test_convert(api: Api) -> None:
+    answer = api("POST", "convert", 200, files=parts({"n.kml": samples.KML}), data={"to": "tmap2"})
+    assert len(yaml.safe_load(answer.content)["nodes"]) == 3
+    assert answer.headers["content-disposition"] == 'attachment; filename="network.tmap2.yaml"'
+    assert int(answer.headers["fleetmap-warnings"]) >= 1, "no datum was given: told as a warning"
+    given = {"to": "datum", "datum": '{"latitude": 53.25, "longitude": -0.5}'}
+    datum = yaml.safe_load(api("POST", "convert", 200, files=parts({"n.kml": samples.KML}), data=given).content)
+    assert datum["datum_latitude"] == 53.25
+    several = api(
+        "POST", "convert", 200, files=parts(samples.grid()), data={"to": "occupancy_grid", "file_type": "png"}
+    )
+    with zipfile.ZipFile(io.BytesIO(several.content)) as archive:
+        assert sorted(archive.namelist()) == ["map.png", "map.yaml"]
+    report = api(
+        "POST", "convert", 200, files=parts({"n.kml": samples.KML}), data={"to": "tmap2", "report": "true"}
+    ).json()
+    assert report["format"] == "tmap2"
+    assert report["files"][0]["name"] == "network.tmap2.yaml"
+    assert report["warnings"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "status"),
+    [
+        ({}, 422),
+        ({"to": "nosuch"}, 404),
+        ({"to": "occupancy_grid"}, 422),
+        ({"to": "tmap2", "format": "nosuch"}, 404),
+        ({"to": "tmap2", "colour": "red"}, 422),
+        ({"to": "tmap2", "datum": "x"}, 422),
+        ({"to": "tmap2", "datum": "99,0"}, 422),
+        ({"to": "tmap2", "datum": '{"latitude": NaN}'}, 422),
+        ({"to": "tmap2", "layer": "sky"}, 422),
+    ],
+)
+def test_conversions_refused(api: Api, fields: dict[str, str], status: int) -> None:
+    api.problem("POST", "convert", status, files=parts({"n.kml": samples.KML}), data=fields)
+
+
+def test_conversions_without_files(api: Api) -> None:
+    api.problem("POST", "convert", 415, json={"to": "kml"})
+    api.problem("POST", "convert", 422, files={"to": (None, "kml")})
+    api.problem("POST", "convert", 422, files=parts({"../x": samples.KML}), data={"to": "tmap2"})
+    api.problem("POST", "convert", 422, files=parts({"x.bin": b"\x00\x01nothing"}), data={"to": "tmap2"})
+
+
+# --- access ---
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Api]]:
+    """A server with an environment and a client of every role."""
+    with running(settings_for(tmp_path_factory.mktemp("guarded"))) as api:
+        api.post("environments", {"name": "farm-1"})
+        api.post("environments", {"name": "street"})
+        api.upload("farm-1", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2()})
+        roles = {role: api.token_for(role) for role in ("viewer", "robot", "editor", "admin")}
+        roles["scoped"] = api.token_for("editor", environments="farm-*")
+        roles["scoped admin"] = api.token_for("admin", environments="farm-*")
+        yield {**roles, "first": api, "nobody": api.as_(None)}
+
+
+E = "environments/farm-1"
+READS = [
+    "environments", E, f"{E}/versions", f"{E}/versions/1", f"{E}/versions/1/sources", f"{E}/versions/1/layers",
+    f"{E}/versions/1/sources/n.tmap2.yaml", f"{E}/versions/1/layers/topology", f"{E}/versions/1/maps",
+    f"{E}/versions/1/maps/tmap2", f"{E}/versions/1/maps/tmap2/network.tmap2.yaml", f"{E}/versions/1/reports/tmap2",
+    f"{E}/diff?from=0&to=1", f"{E}/channels", f"{E}/transform?xy=1,2", "formats", "/maps/farm-1/tmap2",
+    "/maps/farm-1/tmap2/network.tmap2.yaml", "/metrics",
+]  # fmt: skip
+EDITS = [
+    ("POST", f"{E}/versions", {"json": {"revert_to": 99}}),
+    ("POST", f"{E}/edits", {"json": {"changes": [{"op": "delete", "layer": "zones", "id": "x"}]}}),
+    ("PUT", f"{E}/channels/production", {"json": {"version": 99}}),
+    ("DELETE", f"{E}/channels/production/planned", {}),
+    ("POST", "convert", {"files": parts({"n.kml": samples.KML}), "data": {"to": "nosuch"}}),
+    ("PATCH", E, {"json": {"datum": {"latitude": samples.LATITUDE, "longitude": samples.LONGITUDE}}}),
+]
+RULES = [
+    ("POST", "environments", {"json": {"name": "farm-1"}}),
+    ("PATCH", E, {"json": {"title": "x"}}),
+    ("POST", f"{E}/restore", {}),
+    ("POST", f"{E}/purge", {}),
+    ("GET", "tokens", {}),
+    ("POST", "tokens", {"json": {"name": "", "role": "king"}}),
+    ("DELETE", "tokens/nosuch", {}),
+]
+
+
+@pytest.mark.parametrize("path", READS)
+def test_everybody_with_a_token_reads(guarded: dict[str, Api], path: str) -> None:
+    for role in ("viewer", "robot", "editor", "admin"):
+        guarded[role].get(path)
+    answer = guarded["nobody"]("GET", path, 401)
+    assert answer.headers["www-authenticate"].startswith("Bearer")
+    problem(answer)
+
+
+@pytest.mark.parametrize(("method", "path", "more"), EDITS)
+def test_editors_change(guarded: dict[str, Api], method: str, path: str, more: dict[str, object]) -> None:
+    for role in ("viewer", "robot"):
+        guarded[role].problem(method, path, 403, **more)
+    for role in ("editor", "admin"):
+        assert guarded[role](method, path, None, **more).status_code not in (401, 403)
+    guarded["nobody"].problem(method, path, 401, **more)
+
+
+@pytest.mark.parametrize(("method", "path", "more"), RULES)
+def test_administrators_rule(guarded: dict[str, Api], method: str, path: str, more: dict[str, object]) -> None:
+    for role in ("viewer", "robot", "editor"):
+        guarded[role].problem(method, path, 403, **more)
+    assert guarded["admin"](method, path, None, **more).status_code not in (401, 403)
+    guarded["nobody"].problem(method, path, 401, **more)
+
+
+def test_tokens_for_some_environments(guarded: dict[str, Api]) -> None:
+    scoped, ruler = guarded["scoped"], guarded["scoped admin"]
+    assert [e["name"] for e in scoped.get("environments").json()] == ["farm-1"]
+    scoped.get(E)
+    scoped.get("/maps/farm-1/tmap2")
+    scoped.get("/maps/farm-1/tmap2")
+    for path in ("environments/street", "environments/street/versions", "/maps/street/tmap2", "environments/nowhere"):
+        scoped.problem("GET", path, 403)
+    scoped.problem("POST", "environments/street/edits", 403, json={"changes": []})
+    scoped.problem("GET", "/metrics", 403)
+    ruler.problem("GET", "tokens", 403)
+    ruler.problem("POST", "tokens", 403, json={"name": "x", "role": "admin"})
+    ruler.problem("POST", "environments", 403, json={"name": "road"})
+    ruler.problem("POST", "environments", 403, json={"name": "farm-2", "clone": {"environment": "street"}})
+    ruler.problem("PATCH", E, 403, json={"name": "street-2"})
+
+
+def test_a_token_over_a_warm_answer(guarded: dict[str, Api]) -> None:
+    """What is in memory is given to those only who may have it."""
+    path = "/maps/farm-1/tmap2"
+    for _ in range(3):
+        guarded["admin"].get(path)
+    guarded["nobody"].problem("GET", path, 401)
+    guarded["first"].as_("wrong-token").problem("GET", path, 401)
+    outside = guarded["first"].token_for("viewer", environments="street")
+    outside.problem("GET", path, 403)
+    outside.problem("GET", path, 403)
+    guarded["admin"].get(path)
+
+
+def test_open_addresses(guarded: dict[str, Api]) -> None:
+    for path in ("/healthz", "/readyz", "/docs", "/openapi.json", "/docs/swagger-ui-bundle.js"):
+        guarded["nobody"].get(path)
+    for path in ("/", "/nothing", "/api/v1", "/api/v1/nothing", "/metrics"):
+        guarded["nobody"].problem("GET", path, 401)
+
+
+def test_tokens(guarded: dict[str, Api]) -> None:
+    api = guarded["first"]
+    expires = (datetime.now(UTC) + timedelta(days=1)).isoformat()
+    body = {"name": "mower", "role": "robot", "environments": "farm*", "robot": "mower-3", "expires": expires}
+    answer = api.post("tokens", body)
+    made = answer.json()
+    assert answer.headers["cache-control"] == "no-store"
+    assert len(made["token"]) >= 22
+    assert (made["role"], made["robot"], made["environments"]) == ("robot", "mower-3", "farm*")
+    listed = {t["id"]: t for t in api.get("tokens").json()}
+    assert "token" not in listed[made["id"]]
+    assert made["token"] not in api.get("tokens").text
+    mine = api.as_(made["token"])
+    mine.get(E)
+    api("DELETE", f"tokens/{made['id']}", 204)
+    mine.problem("GET", E, 401)
+    api.problem("DELETE", f"tokens/{made['id']}", 404)
+    for bad in (
+        {"name": "x"},
+        {"name": "", "role": "viewer"},
+        {"name": "x", "role": "viewer", "robot": "r"},
+        {"name": "x", "role": "viewer", "expires": "2020-01-01T00:00:00Z"},
+        {"name": "x", "role": "viewer", "expires": "2099-01-01T00:00:00"},
+    ):
+        api.problem("POST", "tokens", 422, json=bad)
+
+
+def test_a_token_ends(guarded: dict[str, Api]) -> None:
+    api = guarded["first"]
+    expires = (datetime.now(UTC) + timedelta(seconds=1.5)).isoformat()
+    short = api.token_for("viewer", expires=expires)
+    short.get("/maps/farm-1/tmap2")
+    time.sleep(2.6)
+    short.problem("GET", "/maps/farm-1/tmap2", 401)
+
+
+def test_the_last_administrator_stays(tmp_path: Path) -> None:
+    with running(settings_for(tmp_path)) as api:
+        (only,) = api.get("tokens").json()
+        api.problem("DELETE", f"tokens/{only['id']}", 409)
+        limited = api.token_for("admin", environments="farm")
+        api.problem("DELETE", f"tokens/{only['id']}", 409)
+        limited.close()
+        second = api.token_for("admin")
+        second("DELETE", f"tokens/{only['id']}", 204)
+        api.problem("GET", "formats", 401)
+
+
+def test_guessing_is_answered_429(tmp_path: Path) -> None:
+    with running(settings_for(tmp_path, token_failures=3)) as api:
+        api.get("formats")
+        wrong = api.as_("wrong")
+        for _ in range(3):
+            wrong.problem("GET", "formats", 401)
+        answer = wrong("GET", "formats", 429)
+        assert int(answer.headers["retry-after"]) > 0
+        problem(answer)
+        wrong.get("/healthz")
+
+
+def test_without_access_control(tmp_path: Path) -> None:
+    with running(settings_for(tmp_path, insecure_no_auth=True, admin_token=None)) as api:
+        open_ = api.as_(None)
+        open_.post("environments", {"name": "farm"})
+        open_.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
+        for _ in range(2):
+            open_.get("/maps/farm/tmap2")
+            open_.problem("GET", "/maps/farm/tmap2", 403, headers={"Host": "evil.example"})
+        open_.problem("GET", "formats", 403, headers={"Host": "evil.example"})
+        open_.problem("POST", "environments", 403, json={"name": "x"}, headers={"Origin": "https://evil.example"})
+        open_.get("formats", headers={"Origin": api.url})
+
+
+# --- health ---
+
+
+def test_health_and_metrics(api: Api, farm: str) -> None:
+    assert api.get("/healthz").json() == {"status": "ok"}
+    assert api.get("/readyz").json()["status"] == "ready"
+    for _ in range(3):
+        api.get(f"/maps/{farm}/tmap2")
+    text = api.get("/metrics").text
+    for name in (
+        "fleetmap_requests_total", "fleetmap_request_seconds_bucket", "fleetmap_conversions_total",
+        "fleetmap_cache_hits_total", "fleetmap_head", "fleetmap_environments", "fleetmap_uploads_total",
+    ):  # fmt: skip
+        assert re.search(rf"^{name}[{{ ]", text, re.MULTILINE), name
+    assert f'fleetmap_head{{environment="{farm}"}} 3.0' in text
+    assert 'route="/maps/{env}/{format}"' in text
+    assert farm not in "".join(line for line in text.splitlines() if line.startswith("fleetmap_requests"))
+
+
+def test_not_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from app.errors import Unavailable
+    from app.store import Store
+
+    with running(settings_for(tmp_path)) as api:
+
+        def away(_: Store) -> None:
+            raise Unavailable("the database does not answer")
+
+        monkeypatch.setattr(Store, "check", away)
+        answer = api("GET", "/readyz", 503)
+        assert int(answer.headers["retry-after"]) > 0
+        problem(answer)
+        api.get("/healthz")
+
+
+# --- errors ---
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "more"),
+    [
+        ("GET", "/nothing", 404, {}),
+        ("GET", "/api/v1/nothing", 404, {}),
+        ("GET", "/api/v1/environments/", 404, {}),
+        ("PUT", "/api/v1/environments", 405, {"json": {}}),
+        ("DELETE", "/healthz", 405, {}),
+        ("POST", "/api/v1/environments", 400, {"content": b"{", "headers": {"Content-Type": "application/json"}}),
+        ("POST", "/api/v1/environments", 422, {"json": {"name": 1}}),
+        ("POST", "/api/v1/environments", 422, {}),
+        ("POST", "/api/v1/environments", 415, {"content": b"{}", "headers": {"Content-Type": "text/json"}}),
+        ("GET", "/docs/nothing.js", 404, {}),
+        ("GET", "/api/v1/jobs/nosuch", 404, {}),
+    ],
+)
+def test_errors_have_one_shape(api: Api, method: str, path: str, status: int, more: dict[str, object]) -> None:
+    answer = api(method, path, status, **more)
+    problem(answer)
+    if status == 405:
+        assert answer.headers["allow"]
+
+
+def test_a_bug_tells_nothing(
+    api: Api, bare: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from app.store import Store
+
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("secret /etc/path and token")
+
+    monkeypatch.setattr(Store, "channels", broken)
+    body = api.problem("GET", f"environments/{bare}/channels", 500)
+    assert "secret" not in str(body)
+    assert "RuntimeError at " in caplog.text
+    assert "secret" not in caplog.text
+    assert "/" not in next(r.getMessage() for r in caplog.records if "internal error" in r.getMessage())
+
+
+def test_damage_is_an_alarm(
+    api: Api, farm: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from app.errors import Damaged
+    from app.store.blobs import Blobs
+
+    def damaged(*_: object) -> bytes:
+        raise Damaged("blob 12ab does not match its hash")
+
+    monkeypatch.setattr(Blobs, "get", damaged)
+    api.problem("GET", f"environments/{farm}/versions/2/sources/network.tmap2.yaml", 500)
+    assert [r for r in caplog.records if r.levelname == "CRITICAL"]
+
+
+def test_a_full_disk_is_told(api: Api, bare: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import errno
+
+    from app.ingest import Ingest
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "/var/lib/somewhere")
+
+    monkeypatch.setattr(Ingest, "upload", full)
+    answer = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, expect=507)
+    assert answer.headers["retry-after"]
+    assert "somewhere" not in answer.text
+    problem(answer)
+
+
+def test_tokens_do_not_reach_the_log(api: Api, bare: str, caplog: pytest.LogCaptureFixture) -> None:
+    api.get(f"environments/{bare}")
+    api.as_("a-wrong-token-of-mine").problem("GET", "formats", 401)
+    assert ADMIN not in caplog.text
+    assert "a-wrong-token-of-mine" not in caplog.text
+
+
+# --- the first start ---
+
+
+def test_the_first_start_prints_a_token_once(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    settings = settings_for(tmp_path, admin_token=None)
+    with running(settings) as api:
+        (token,) = re.findall(r"only this once: (\S+)", capfd.readouterr().out)
+        assert len(token) >= 22
+        api.as_(token).get("tokens")
+    with running(settings) as api:
+        assert "token" not in capfd.readouterr().out
+        api.as_(token).post("environments", {"name": "kept"})
+    with running(settings_for(tmp_path)) as api:
+        assert [e["name"] for e in api.get("environments").json()] == ["kept"]
+        api.as_(token).get("tokens")
+
+
+def test_stops_cleanly(tmp_path: Path) -> None:
+    with running(settings_for(tmp_path)) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
+        here = api.app.state.services
+        workers = [w.process for w in here.pool._workers.values()]
+        assert workers
+    assert not any(w.is_alive() for w in workers)
+    assert not list((tmp_path / "spool").iterdir())
+    with running(settings_for(tmp_path)) as api:
+        assert api.get("environments/farm").json()["version"] == 1
+
+
+Fresh = Callable[[], str]
+
+
+def test_settings_reach_the_pool(tmp_path: Path) -> None:
+    with running(settings_for(tmp_path, max_features=5)) as api:
+        api.post("environments", {"name": "farm"})
+        answer = api.upload("farm", {"n.tmap2.yaml": samples.tmap2()}, expect=413)
+        assert "5" in problem(answer)["detail"]
+    assert API == "/api/v1"

@@ -1,0 +1,253 @@
+"""The form of an upload: bounds, names, broken bodies; nothing half stored, nothing left behind."""
+
+from __future__ import annotations
+
+import http.client
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from tests.api import samples
+from tests.api.conftest import ADMIN, Api, parts, problem, running, settings_for
+
+BOUNDARY = "frontier"
+
+
+@pytest.fixture(scope="module")
+def tight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
+    """A server with small limits."""
+    settings = settings_for(
+        tmp_path_factory.mktemp("tight"),
+        max_upload_bytes=200_000,
+        max_files=5,
+        max_uploads=1,
+        max_json_bytes=2048,
+        body_seconds=1.0,
+        header_seconds=1.0,
+    )
+    with running(settings) as api:
+        api.post("environments", {"name": "farm"})
+        yield api
+
+
+def raw(api: Api, body: bytes, content_type: str = f"multipart/form-data; boundary={BOUNDARY}") -> object:
+    return api("POST", "environments/farm/versions", content=body, headers={"Content-Type": content_type})
+
+
+def part(disposition: str, data: bytes, extra: str = "") -> bytes:
+    head = f"--{BOUNDARY}\r\nContent-Disposition: {disposition}\r\n{extra}\r\n".encode()
+    return head + data + b"\r\n"
+
+
+END = f"--{BOUNDARY}--\r\n".encode()
+FILE = part('form-data; name="files"; filename="n.tmap2.yaml"', samples.tmap2())
+
+
+def spool_is_empty(api: Api) -> bool:
+    """No upload of this process is left on disk."""
+    spool: Path = api.app.state.services.options.spool_dir
+    return [p.name for p in spool.rglob("*") if p.is_file()] == ["alive"]
+
+
+def test_plain(tight: Api) -> None:
+    answer = raw(tight, FILE + part('form-data; name="dry_run"', b"true") + END)
+    assert answer.status_code == 200, answer.text  # type: ignore[attr-defined]
+    assert spool_is_empty(tight)
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        (b"", 422),
+        (END, 422),
+        (FILE, 400),
+        (FILE[:-200], 400),
+        (b"garbage", 400),
+        (part('form-data; name="files"', samples.tmap2()) + END, 422),
+        (part('form-data; name="files"; filename=""', b"x") + END, 422),
+        (part('form-data; name="upload"; filename="a"', b"x") + END, 422),
+        (part("attachment", b"x") + END, 400),
+        (part('form-data; filename="a"', b"x") + END, 400),
+        (part('form-data; name="files"; filename="../a"', b"x") + END, 422),
+        (part('form-data; name="files"; filename="/etc/passwd"', b"x") + END, 422),
+        (part('form-data; name="files"; filename="a\\\\b"', b"x") + END, 422),
+        (part('form-data; name="files"; filename="a//b"', b"x") + END, 422),
+        (part('form-data; name="files"; filename="a\x01b"', b"x") + END, 422),
+        (FILE + FILE + END, 422),
+        (FILE + part('form-data; name="mode"', b"replace") * 2 + END, 422),
+        (FILE + part('form-data; name="mode"', b"sometimes") + END, 422),
+        (FILE + part('form-data; name="layer"', b"sky") + END, 422),
+        (FILE + part('form-data; name="dry_run"', b"perhaps") + END, 422),
+        (FILE + part('form-data; name="format"', b"word") + END, 404),
+        (FILE + part('form-data; name="no_such_option"', b"1") + END, 422),
+        (FILE + part('form-data; name="message"', b"\xff\xfe") + END, 422),
+        (FILE + part('form-data; name="message"', b"x" * 70_000) + END, 413),
+        (part('form-data; name="files"; filename="a"', b"x", "Content-Transfer-Encoding: base64\r\n") + END, 400),
+        (part('form-data; name="files"; filename="a"', b"x", "X: y\r\n" * 50) + END, 400),
+        (part('form-data; name="files"; filename="a"', b"x", "X: " + "y" * 20_000 + "\r\n") + END, 400),
+        (b"".join(part(f'form-data; name="f{k}"', b"x") for k in range(200)) + END, 413),
+        (b"".join(part(f'form-data; name="files"; filename="f{k}"', b"x") for k in range(6)) + END, 413),
+        (part('form-data; name="files"; filename="big"', b"x" * 300_000) + END, 413),
+    ],
+)
+def test_forms_that_are_refused(tight: Api, body: bytes, status: int) -> None:
+    answer = raw(tight, body)
+    assert answer.status_code == status, answer.text  # type: ignore[attr-defined]
+    problem(answer)  # type: ignore[arg-type]
+    assert tight.get("environments/farm").json()["version"] == 0
+    assert spool_is_empty(tight)
+
+
+@pytest.mark.parametrize(
+    "content_type",
+    ["multipart/form-data", "multipart/form-data; boundary=", "multipart/form-data; boundary=" + "x" * 999],
+)
+def test_without_a_boundary(tight: Api, content_type: str) -> None:
+    assert raw(tight, FILE + END, content_type).status_code == 400  # type: ignore[attr-defined]
+
+
+def test_other_media_types(tight: Api) -> None:
+    for content_type in ("text/plain", "application/x-www-form-urlencoded", "application/octet-stream"):
+        answer = raw(tight, b"x", content_type)
+        assert answer.status_code == 415  # type: ignore[attr-defined]
+        problem(answer)  # type: ignore[arg-type]
+    tight.problem("POST", "environments", 415, content=b'{"name": "x"}', headers={"Content-Type": "text/plain"})
+    tight.problem("POST", "environments", 415, files=parts({"a": b"b"}))
+
+
+def test_compressed_bodies(tight: Api) -> None:
+    for coding in ("gzip", "zstd", "br", "gzip, identity"):
+        headers = {"Content-Encoding": coding, "Content-Type": f"multipart/form-data; boundary={BOUNDARY}"}
+        tight.problem("POST", "environments/farm/versions", 415, content=FILE + END, headers=headers)
+    headers = {"Content-Encoding": "identity", "Content-Type": f"multipart/form-data; boundary={BOUNDARY}"}
+    tight("POST", "environments/farm/versions?dry_run=true", 200, content=FILE + END, headers=headers)
+
+
+def test_a_declared_length_is_enough_to_refuse(tight: Api) -> None:
+    place = urlsplit(tight.url)
+    connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=10)
+    connection.putrequest("POST", "/api/v1/environments/farm/versions")
+    connection.putheader("Authorization", f"Bearer {ADMIN}")
+    connection.putheader("Content-Type", f"multipart/form-data; boundary={BOUNDARY}")
+    connection.putheader("Content-Length", str(10 * 2**30))
+    connection.putheader("Expect", "100-continue")
+    connection.endheaders()
+    answer = connection.getresponse()
+    assert answer.status == 413
+    assert answer.getheader("Content-Type") == "application/problem+json"
+    assert answer.getheader("Connection") == "close"
+    connection.close()
+
+
+def test_json_bodies_are_bounded(tight: Api) -> None:
+    body = {"name": "x", "description": "y" * 5000}
+    tight.problem("POST", "environments", 413, json=body)
+    chunks = (b"x" * 500 for _ in range(10))
+    tight.problem("POST", "environments", 413, content=chunks, headers={"Content-Type": "application/json"})
+
+
+def _request(api: Api, head: str) -> socket.socket:
+    place = urlsplit(api.url)
+    line = socket.create_connection((place.hostname or "", place.port or 0), timeout=15)
+    line.sendall(head.encode())
+    return line
+
+
+def test_a_body_that_stops_coming(tight: Api) -> None:
+    with _request(
+        tight,
+        "POST /api/v1/environments/farm/versions HTTP/1.1\r\nHost: x\r\n"
+        f"Authorization: Bearer {ADMIN}\r\nContent-Type: multipart/form-data; boundary={BOUNDARY}\r\n"
+        "Content-Length: 1000\r\n\r\n--fron",
+    ) as line:
+        started = time.monotonic()
+        answer = line.recv(65536)
+        assert answer.startswith(b"HTTP/1.1 408 ")
+        assert 0.5 < time.monotonic() - started < 10
+    assert spool_is_empty(tight)
+
+
+def test_a_head_that_stops_coming(tight: Api) -> None:
+    for head in ("", "GET /healthz HTTP/1.1\r\nHost: x\r\nX-Slow: "):
+        with _request(tight, head) as line:
+            assert line.recv(65536) == b"", "the connection is closed without an answer"
+
+
+def test_a_head_without_end(tight: Api) -> None:
+    with _request(tight, "GET /healthz HTTP/1.1\r\nHost: x\r\nX: " + "y" * 100_000 + "\r\n\r\n") as line:
+        assert line.recv(65536).startswith(b"HTTP/1.1 431 ")
+    with _request(tight, "no http at all\r\n\r\n") as line:
+        answer = line.recv(65536)
+        assert answer.startswith(b"HTTP/1.1 400 ")
+        assert b"application/problem+json" in answer
+
+
+def test_a_client_that_goes_away(tight: Api) -> None:
+    line = _request(
+        tight,
+        "POST /api/v1/environments/farm/versions HTTP/1.1\r\nHost: x\r\n"
+        f"Authorization: Bearer {ADMIN}\r\nContent-Type: multipart/form-data; boundary={BOUNDARY}\r\n"
+        f"Content-Length: 100000\r\n\r\n--{BOUNDARY}\r\n",
+    )
+    line.close()
+    deadline = time.monotonic() + 10
+    while not spool_is_empty(tight):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert raw(tight, FILE + part('form-data; name="dry_run"', b"true") + END).status_code == 200  # type: ignore[attr-defined]
+
+
+def test_more_uploads_than_places(tight: Api) -> None:
+    with _request(
+        tight,
+        "POST /api/v1/environments/farm/versions HTTP/1.1\r\nHost: x\r\n"
+        f"Authorization: Bearer {ADMIN}\r\nContent-Type: multipart/form-data; boundary={BOUNDARY}\r\n"
+        f"Content-Length: 100000\r\n\r\n--{BOUNDARY}\r\n",
+    ):
+        deadline = time.monotonic() + 5
+        while spool_is_empty(tight) and not _active(tight):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        answer = raw(tight, FILE + END)
+        assert answer.status_code == 503  # type: ignore[attr-defined]
+        assert int(answer.headers["retry-after"]) > 0  # type: ignore[attr-defined]
+        problem(answer)  # type: ignore[arg-type]
+
+
+def _active(api: Api) -> bool:
+    return bool(api.app.state.services.intake._active)
+
+
+def test_what_a_killed_server_left_is_removed(tmp_path: Path) -> None:
+    left = tmp_path / "spool" / "dead" / "upload"
+    left.mkdir(parents=True)
+    (left / "0").write_bytes(b"half a file")
+    (tmp_path / "spool" / "dead" / "alive").touch()
+    with running(settings_for(tmp_path)) as api:
+        assert not left.exists()
+        assert spool_is_empty(api)
+    assert not any((tmp_path / "spool").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("bad.yaml", b"nodes: [\n"),
+        ("bomb.tmap2.yaml", b"a: &a [x,x]\nb: &b [*a,*a]\n" + b"".join(
+            b"%c: &%c [*%c,*%c]\n" % (k + 1, k + 1, k, k) for k in range(98, 121)) + b"nodes: *y\n"),
+        ("bad.kml", b'<?xml version="1.0"?><!DOCTYPE k [<!ENTITY a "b">]><kml>&a;</kml>'),
+        ("bad.zip", b"PK\x03\x04nonsense"),
+        ("map.yaml", b"image: ../../etc/passwd\nresolution: 0.05\norigin: [0,0,0]\noccupied_thresh: 0.65\n"
+                     b"free_thresh: 0.196\nnegate: 0\n"),
+        ("datum.yaml", b"datum_latitude: 99\ndatum_longitude: .nan\n"),
+    ],
+)  # fmt: skip
+def test_damaged_files(api: Api, bare: str, name: str, data: bytes) -> None:
+    answer = api.upload(bare, {name: data}, expect=422)
+    body = problem(answer)
+    assert body["errors"], body
+    assert api.get(f"environments/{bare}").json()["version"] == 0

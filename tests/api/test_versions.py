@@ -1,0 +1,271 @@
+"""Uploads, history, reverts, edits and sources over HTTP."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+
+import pytest
+
+from tests.api import samples
+from tests.api.conftest import Api, problem
+
+
+def test_an_upload_is_a_version(api: Api, bare: str) -> None:
+    answer = api.upload(bare, {"network.tmap2.yaml": samples.tmap2()}, message="driven today")
+    body = answer.json()
+    assert answer.headers["location"] == f"/api/v1/environments/{bare}/versions/1"
+    assert answer.headers["etag"] == '"1"'
+    assert set(body) == {
+        "environment", "version", "root", "parent", "author", "message", "time", "changes", "sources", "warnings",
+        "information",
+    }  # fmt: skip
+    assert (body["environment"], body["version"], body["parent"]) == (bare, 1, 0)
+    assert (body["author"], body["message"]) == ("administrator", "driven today")
+    assert body["time"].endswith("Z")
+    assert body["changes"]["topology"] == {"added": 6, "changed": 0, "deleted": 0}
+    assert body["information"]["topology"] == "raw"
+    assert body["information"]["occupancy"] == "missing"
+    digest = hashlib.sha256(samples.tmap2()).hexdigest()
+    (source,) = body["sources"]
+    assert source == {
+        "name": "network.tmap2.yaml", "size": len(samples.tmap2()), "sha256": digest, "format": "tmap2", "used": True,
+    }  # fmt: skip
+    assert api.get(answer.headers["location"]).json() == body
+
+
+def test_nothing_changed(api: Api, bare: str) -> None:
+    api.upload(bare, {"a.tmap2.yaml": samples.tmap2()})
+    again = api.upload(bare, {"b.tmap2.yaml": samples.tmap2()}, expect=200)
+    assert again.json()["version"] == 1
+    assert {s["name"] for s in api.get(f"environments/{bare}/versions/1/sources").json()} >= {"b.tmap2.yaml"}
+    assert len(api.get(f"environments/{bare}/versions").json()) == 2
+
+
+def test_several_files_and_folders_are_one_version(api: Api, bare: str) -> None:
+    files = {
+        "config/location/datum.yaml": samples.DATUM,
+        "config/topological/network.tmap2.yaml": samples.tmap2(),
+        **{f"config/metric/map/{name}": data for name, data in samples.grid().items()},
+    }
+    body = api.upload(bare, files).json()
+    assert body["version"] == 1
+    assert {s["name"] for s in body["sources"]} == set(files)
+    for name, data in files.items():
+        assert api.get(f"environments/{bare}/versions/1/sources/{name}").content == data
+    info = body["information"]
+    assert (info["location"], info["topology"], info["occupancy"]) == ("raw", "raw", "raw")
+
+
+def test_a_zip_is_the_same_as_its_files(api: Api, bare: str) -> None:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name, data in samples.grid().items():
+            archive.writestr(f"grids/{name}", data)
+    body = api.upload(bare, {"grids.zip": packed.getvalue()}).json()
+    assert body["information"]["occupancy"] == "raw"
+    assert api.get(f"environments/{bare}/versions/1/sources/grids/map.yaml").content == samples.grid()["map.yaml"]
+
+
+def test_a_dry_run_stores_nothing(api: Api, bare: str) -> None:
+    body = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, expect=200, dry_run="true").json()
+    assert body["version"] is None
+    assert body["changes"]["topology"]["added"] == 6
+    assert len(body["root"]) == 64
+    assert api.get(f"environments/{bare}").json()["version"] == 0
+    made = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}).json()
+    assert made["root"] == body["root"]
+
+
+@pytest.mark.parametrize("tag", ['"0"', '"7", "0"', "*"])
+def test_if_match_that_holds(api: Api, bare: str, tag: str) -> None:
+    api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, headers={"If-Match": tag})
+
+
+def test_if_match_by_root(api: Api, bare: str) -> None:
+    root = api.get(f"environments/{bare}").json()["root"]
+    api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, headers={"If-Match": f'"{root}"'})
+    answer = api.upload(bare, {"datum.yaml": samples.DATUM}, expect=412, headers={"If-Match": f'"{root}"'})
+    assert "version 1" in problem(answer)["detail"]
+
+
+def test_an_answer_that_got_lost(api: Api, bare: str) -> None:
+    headers = {"Idempotency-Key": "k-1"}
+    first = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, headers=headers, message="m")
+    api.upload(bare, {"datum.yaml": samples.DATUM})
+    second = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, headers=headers, message="m")
+    assert second.json() == first.json()
+    assert second.headers["location"] == first.headers["location"]
+    problem(api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, expect=409, headers=headers, message="other"))
+    assert api.get(f"environments/{bare}").json()["version"] == 2
+
+
+def test_a_revert_is_a_version(api: Api, farm: str) -> None:
+    body = {"revert_to": 1, "message": "the gate was open"}
+    answer = api.post(f"environments/{farm}/versions", body, headers={"If-Match": '"3"', "Idempotency-Key": "r"})
+    made = answer.json()
+    assert (made["version"], made["parent"], made["message"]) == (4, 3, "the gate was open")
+    assert made["root"] == api.get(f"environments/{farm}/versions/1").json()["root"]
+    again = api.post(f"environments/{farm}/versions", body, headers={"If-Match": '"3"', "Idempotency-Key": "r"})
+    assert again.json() == made
+    api.post(f"environments/{farm}/versions", {"revert_to": 4}, expect=200)
+    api.problem("POST", f"environments/{farm}/versions", 404, json={"revert_to": 99})
+    api.problem("POST", f"environments/{farm}/versions", 412, json=body, headers={"If-Match": '"3"'})
+    for bad in ({}, {"revert_to": -1}, {"revert_to": "x"}, {"revert_to": 1, "extra": 2}, []):
+        api.problem("POST", f"environments/{farm}/versions", 422, json=bad)
+
+
+def test_history_newest_first_in_pages(api: Api, farm: str) -> None:
+    first = api.get(f"environments/{farm}/versions?limit=3")
+    assert [v["version"] for v in first.json()] == [3, 2, 1]
+    second = api.get(first.links["next"]["url"])
+    assert [v["version"] for v in second.json()] == [0]
+    assert "next" not in second.links
+    assert "link" not in api.get(f"environments/{farm}/versions?limit=4").headers
+    api.problem("GET", f"environments/{farm}/versions?cursor=x", 422)
+
+
+def test_versions_by_number_and_channel(api: Api, farm: str) -> None:
+    answer = api.get(f"environments/{farm}/versions/latest")
+    assert answer.json()["version"] == 3
+    assert answer.headers["fleetmap-root"] == answer.json()["root"]
+    assert api.get(f"environments/{farm}/versions/0").json()["parent"] is None
+    for missing in ("99", "production", "nosuch"):
+        api.problem("GET", f"environments/{farm}/versions/{missing}", 404)
+    for bad in ("-1", "1.5", "A", "9" * 30):
+        api.problem("GET", f"environments/{farm}/versions/{bad}", 422)
+
+
+# --- sources ---
+
+
+def test_sources_are_attachments(api: Api, farm: str) -> None:
+    answer = api.get(f"environments/{farm}/versions/2/sources/network.tmap2.yaml")
+    assert answer.content == samples.tmap2()
+    assert answer.headers["content-type"] == "application/octet-stream"
+    assert answer.headers["content-disposition"] == 'attachment; filename="network.tmap2.yaml"'
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    etag = answer.headers["etag"]
+    assert etag == f'"{hashlib.sha256(samples.tmap2()).hexdigest()}"'
+    path = f"environments/{farm}/versions/2/sources/network.tmap2.yaml"
+    assert api.get(path, 304, headers={"If-None-Match": etag}).content == b""
+    part = api.get(path, 206, headers={"Range": "bytes=2-5"})
+    assert part.content == samples.tmap2()[2:6]
+    assert part.headers["content-range"] == f"bytes 2-5/{len(samples.tmap2())}"
+    beyond = api.get(path, 416, headers={"Range": "bytes=999999-"})
+    assert beyond.headers["content-range"] == f"bytes */{len(samples.tmap2())}"
+    problem(beyond)
+    api.problem("GET", f"environments/{farm}/versions/2/sources/other.yaml", 404)
+
+
+# --- edits ---
+
+
+def put(item: str, x: float, y: float, **more: object) -> dict[str, object]:
+    shape = {"type": "Point", "coordinates": [x, y]}
+    feature = {
+        "type": "Feature",
+        "id": item,
+        "geometry": None,
+        "place": shape,
+        "properties": {"kind": "node", "name": item},
+    }
+    return {"op": "put", "layer": "topology", "feature": feature, **more}
+
+
+def test_a_node_is_moved_and_its_edges_follow(api: Api, farm: str) -> None:
+    answer = api.post(f"environments/{farm}/edits", {"message": "moved", "changes": [put("barn", 12.0, 1.0)]})
+    body = answer.json()
+    assert (body["version"], body["message"]) == (4, "moved")
+    assert body["changes"]["topology"] == {"added": 0, "changed": 4, "deleted": 0}
+    layer = api.get(f"environments/{farm}/versions/4/layers/topology?crs=local").json()
+    places = {f["id"]: f["place"]["coordinates"] for f in layer["features"]}
+    assert places["barn"] == [12.0, 1.0]
+    assert places["gate_barn"][-1] == [12.0, 1.0]
+    assert places["barn_field"][0] == [12.0, 1.0]
+    before = api.get(f"environments/{farm}/versions/3/layers/topology?crs=local").json()
+    assert {f["id"]: f["place"]["coordinates"] for f in before["features"]}["barn"] == [10.0, 0.0]
+
+
+def test_a_dangling_edge_is_refused(api: Api, farm: str) -> None:
+    answer = api.problem(
+        "POST",
+        f"environments/{farm}/edits",
+        422,
+        json={"message": "", "changes": [{"op": "delete", "layer": "topology", "id": "barn"}]},
+    )
+    assert {e["where"] for e in answer["errors"]} == {"gate_barn", "barn_gate", "barn_field"}
+    assert api.get(f"environments/{farm}").json()["version"] == 3
+    everything = [
+        {"op": "delete", "layer": "topology", "id": i} for i in ("barn", "gate_barn", "barn_gate", "barn_field")
+    ]
+    body = api.post(f"environments/{farm}/edits", {"changes": everything}).json()
+    assert body["changes"]["topology"]["deleted"] == 4
+
+
+def test_cells_in_a_polygon(api: Api, farm: str) -> None:
+    ring = [[-0.5, -2.0], [0.5, -2.0], [0.5, -1.0], [-0.5, -1.0], [-0.5, -2.0]]
+    change = {
+        "op": "cells",
+        "grid": "map",
+        "polygon": {"type": "Polygon", "coordinates": [ring]},
+        "crs": "local",
+        "value": 100,
+    }
+    body = api.post(f"environments/{farm}/edits", {"changes": [change]}).json()
+    assert body["changes"]["occupancy"]["map"]["blocked"] == 4
+    url = f"environments/{farm}/versions/{{}}/layers/occupancy"
+    before, after = (api.get(url.format(v), headers={"Accept": "application/json"}).json() for v in (3, 4))
+    assert after["counts"]["occupied"] == before["counts"]["occupied"] + 4
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"op": "paint"},
+        {"op": "put", "layer": "topology"},
+        {"op": "put", "layer": "occupancy", "feature": {}},
+        {"op": "put", "layer": "topology", "feature": {"type": "Feature", "properties": {"kind": "node"}}},
+        {"op": "put", "layer": "topology", "feature": {"type": "Feature", "id": "n", "properties": {}}, "extra": 1},
+        {"op": "delete", "layer": "topology", "id": "nobody"},
+        {"op": "cells", "grid": "nosuch", "polygon": {"type": "Polygon", "coordinates": []}, "value": 0},
+        {"op": "cells", "polygon": {"type": "Point", "coordinates": [0, 0]}, "value": 0},
+        {"op": "cells", "polygon": {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1]]]}, "value": 101},
+        {"op": "put", "layer": "topology", "feature": {"type": "Feature", "id": "n", "geometry": {"type": "Point",
+         "coordinates": [999, 0]}, "properties": {"kind": "node"}}},
+        {"op": "put", "layer": "topology", "feature": {"type": "Feature", "id": "n", "geometry": {"type": "Point",
+         "coordinates": ["x", None]}, "properties": {"kind": "node"}}},
+        {"op": "put", "layer": "objects", "feature": {"type": "Feature", "id": "o", "geometry": None,
+         "properties": {"number": 123456789012345678901234567890}}},
+    ],
+)  # fmt: skip
+def test_edits_refused(api: Api, farm: str, change: object) -> None:
+    api.problem("POST", f"environments/{farm}/edits", 422, json={"changes": [change]})
+    assert api.get(f"environments/{farm}").json()["version"] == 3
+
+
+def test_edits_on_top_of_a_version(api: Api, farm: str) -> None:
+    body = {"changes": [put("new", 1.0, 1.0)]}
+    api.problem("POST", f"environments/{farm}/edits", 412, json=body, headers={"If-Match": '"2"'})
+    first = api.post(f"environments/{farm}/edits", body, headers={"If-Match": '"3"', "Idempotency-Key": "e"})
+    assert api.post(f"environments/{farm}/edits", body, headers={"If-Match": '"3"', "Idempotency-Key": "e"}).json() == (
+        first.json()
+    )
+    api.problem("POST", f"environments/{farm}/edits", 422, json={"changes": []})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"changes": [{"op": "put", "layer": "objects", "feature": {"type": "Feature", "id": "a", "geometry": null, '
+        '"properties": {"x": NaN}}}]}',
+        '{"changes": [',
+        "\ud800".encode("utf-8", "surrogatepass"),
+        '{"message": "\\ud800", "changes": []}',
+        "[" * 5000,
+    ],
+)
+def test_json_that_is_none(api: Api, farm: str, text: str | bytes) -> None:
+    headers = {"Content-Type": "application/json"}
+    api.problem("POST", f"environments/{farm}/edits", 400, content=text, headers=headers)
