@@ -17,6 +17,7 @@ from app.store.collect import Collection
 from app.store.content import Content
 from app.store.database import Database
 from app.store.environments import Environments
+from app.store.generation import Generation
 from app.store.index import SpatialIndex
 from app.store.jobs import Jobs
 from app.store.outbox import Outbox
@@ -31,14 +32,16 @@ class Store(Environments, Versions, Content, SpatialIndex, Channels, Outbox, Tok
     """One database and one blob folder. Thread-safe; cheap to open again in a worker process.
 
     database_url: ``sqlite:///PATH`` or ``postgresql+psycopg://…`` (with PostGIS). readonly: nothing can be written,
-    by the database's own means; ``prepare`` and all reading work.
+    by the database's own means; ``prepare`` and all reading work. ``generation()`` is a number that changes with every
+    committed write on this host.
     """
 
     def __init__(self, database_url: str, blob_dir: Path, *, readonly: bool = False) -> None:
         self.database_url = database_url
         self.blob_dir = Path(blob_dir)
         self.readonly = readonly
-        self._database = Database(database_url, readonly=readonly)
+        self.generation = Generation(self.blob_dir)
+        self._database = Database(database_url, readonly=readonly, written=self.generation.change)
         self._chunks = Chunks(self._database)
         self.blobs = Blobs(self._database, self.blob_dir, readonly=readonly)
 
@@ -62,6 +65,7 @@ class Store(Environments, Versions, Content, SpatialIndex, Channels, Outbox, Tok
     def close(self) -> None:
         """Give back connections."""
         self._database.close()
+        self.generation.close()
 
 
 __all__ = ["Store"]

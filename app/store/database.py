@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -74,10 +74,14 @@ def _sqlite_begin(connection: Connection) -> None:
 
 
 class Database:
-    """Transactions on an engine. Every database error that another try may not have becomes Unavailable."""
+    """Transactions on an engine. Every database error that another try may not have becomes Unavailable.
 
-    def __init__(self, url: str, *, readonly: bool) -> None:
+    written: called after each commit, so that caches in memory can tell.
+    """
+
+    def __init__(self, url: str, *, readonly: bool, written: Callable[[], None] = lambda: None) -> None:
         self.engine = engine(url, readonly=readonly)
+        self._written = written
         self.sqlite = self.engine.dialect.name == "sqlite"
 
     @contextmanager
@@ -101,6 +105,7 @@ class Database:
             connection.execution_options(write=True)
             with connection.begin():
                 yield connection
+        self._written()
 
     def close(self) -> None:
         """Give back all connections."""

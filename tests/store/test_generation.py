@@ -1,0 +1,40 @@
+"""The number that tells caches of a change, in this process and in another one."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from app.store import Store
+from app.store.generation import Generation
+
+
+def test_it_changes_with_every_write_and_with_nothing_else(tmp_path: Path) -> None:
+    store = Store(f"sqlite:///{tmp_path}/a.sqlite", tmp_path / "blobs")
+    store.migrate()
+    before = store.generation()
+    assert store.environments() == ([], None)
+    assert store.generation() == before
+    store.create_environment("farm")
+    after = store.generation()
+    assert after != before
+    store.create_token("somebody", "viewer")
+    assert store.generation() != after
+    store.close()
+
+
+def test_another_process_sees_it(tmp_path: Path) -> None:
+    here = Generation(tmp_path)
+    before = here()
+    code = f"from pathlib import Path; from app.store.generation import Generation; Generation(Path({str(tmp_path)!r})).change()"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert here() != before
+    here.close()
+
+
+def test_without_a_folder_it_works_in_this_process(tmp_path: Path) -> None:
+    here = Generation(tmp_path / "absent")
+    before = here()
+    here.change()
+    assert here() != before
