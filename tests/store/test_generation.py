@@ -27,7 +27,8 @@ def test_it_changes_with_every_write_and_with_nothing_else(tmp_path: Path) -> No
 def test_another_process_sees_it(tmp_path: Path) -> None:
     here = Generation(tmp_path)
     before = here()
-    code = f"from pathlib import Path; from app.store.generation import Generation; Generation(Path({str(tmp_path)!r})).change()"
+    code = "from pathlib import Path; from app.store.generation import Generation; "
+    code += f"Generation(Path({str(tmp_path)!r})).change()"
     subprocess.run([sys.executable, "-c", code], check=True)
     assert here() != before
     here.close()
