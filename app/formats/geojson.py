@@ -113,6 +113,18 @@ def _check_depth(data: bytes) -> None:
         raise UnreadableFile(reason, [Problem(reason)])
 
 
+def _marked(p: Any) -> bool:
+    """Whether these properties carry our own words."""
+    return (
+        isinstance(p, dict)
+        and "part" in p
+        and isinstance(p.get("layer"), str)
+        and p["layer"] in VECTOR_LAYERS
+        and isinstance(p.get("level"), str)
+        and isinstance(p["part"], str)
+    )
+
+
 def _refuse(reason: str, line: int | None = None, where: str | None = None) -> NoReturn:
     raise UnreadableFile(f"{where}: {reason}" if where else reason, [Problem(reason, line=line, where=where)])
 
@@ -126,6 +138,7 @@ class _Reader:
         self.top = top
         self.root = str(top.get("type"))
         self.rows = self._rows()
+        self.marks = [_marked(row.get("properties")) for row in self.rows]
         if len(self.rows) > context.limits.features:
             raise TooLarge(f"{context.main} has {len(self.rows)} features; the limit is {context.limits.features}")
         self.local = self._is_local(top.get("coordRefSys"))
@@ -182,7 +195,7 @@ class _Reader:
         own = self.top.get(OWN)
         own = own if isinstance(own, dict) else {}
         network = self._network()
-        keys = [self._key(row, network) for row in self.rows]
+        keys = [self._key(k, network) for k in range(len(self.rows))]
         raw = [self._geometry_of(k, row) for k, row in enumerate(self.rows)]
         local = np.array([place for place, _ in raw], bool)
         shapes, odd = _geometries([g for _, g in raw], lambda k, reason: _refuse(reason, self.line(k), self.name(k)))
@@ -207,7 +220,7 @@ class _Reader:
                 self._properties(
                     k,
                     i,
-                    foreign=not self._marked(self.rows[k]) and key == home,
+                    foreign=not self.marks[k] and key == home,
                     odd=odd.get(k),
                     at=(shapes[k], bool(local[k])),
                 )
@@ -228,18 +241,9 @@ class _Reader:
         row = self.rows[k]
         return f"feature {row['id']!r}" if row.get("id") is not None else f"features[{k}]"
 
-    def _marked(self, row: dict[str, Any]) -> bool:
-        p = row.get("properties")
-        return (
-            isinstance(p, dict)
-            and isinstance(p.get("layer"), str)
-            and p["layer"] in VECTOR_LAYERS
-            and isinstance(p.get("level"), str)
-            and isinstance(p.get("part"), str)
-        )
-
-    def _key(self, row: dict[str, Any], network: bool) -> PartKey:
-        if self._marked(row):
+    def _key(self, k: int, network: bool) -> PartKey:
+        row = self.rows[k]
+        if self.marks[k]:
             p = row["properties"]
             return PartKey(cast(Layer, p["layer"]), p["level"], p["part"])
         if network and row["properties"].get("kind") in ("node", "edge"):
@@ -249,9 +253,9 @@ class _Reader:
     def _network(self) -> bool:
         """Whether the unmarked features are a topology: edges whose ends are all there."""
         nodes, ends = set(), []
-        for row in self.rows:
+        for row, mark in zip(self.rows, self.marks, strict=True):
             p = row.get("properties")
-            if self._marked(row):
+            if mark:
                 continue
             if not isinstance(p, dict) or not isinstance(row.get("id"), str) or p.get("kind") not in ("node", "edge"):
                 return False
@@ -322,7 +326,7 @@ class _Reader:
             _refuse("properties must be an object or null", self.line(k), self.name(k))
         out: dict[str, Any] = dict(said or {})
         if not foreign:
-            if not self._marked(row):
+            if not self.marks[k]:
                 return out
             more = out.pop("more", None)
             for word in ("layer", "level", "part"):
@@ -392,28 +396,48 @@ def _geometries(raw: Sequence[Any], refuse: Refuse) -> tuple[NDArray[np.object_]
     """Shapely geometries of GeoJSON ones, and by place those whose text says more than the shape."""
     out = np.empty(len(raw), object)
     odd: dict[int, Any] = {}
-    points: list[int] = []
+    plain: dict[str, list[int]] = {"Point": [], "LineString": []}
+    single: list[int] = []
     for k, geometry in enumerate(raw):
         if geometry is None:
             out[k] = NO_GEOMETRY
-        elif geometry.get("type") == "Point" and len(geometry) == 2 and len(geometry.get("coordinates") or ()) == 2:
-            points.append(k)
+        elif len(geometry) == 2 and isinstance(geometry.get("coordinates"), list) and geometry["coordinates"]:
+            kind = geometry.get("type")
+            (plain[kind] if kind in ("Point", "LineString") else single).append(k)
         else:
-            one = _One()
-            try:
-                out[k] = one.shape(geometry)
-            except (ValueError, shapely.errors.GEOSException) as error:
-                refuse(k, str(error))
-            if one.odd or out[k].is_empty:
-                odd[k] = geometry
-    if points:
-        rows = [raw[k]["coordinates"] for k in points]
-        kinds = set(map(type, chain.from_iterable(rows)))
-        if not kinds <= {int, float}:
-            wrong = next(n for n, row in enumerate(rows) if not set(map(type, row)) <= {int, float})
-            refuse(points[wrong], "a position must be two or three numbers")
-        out[points] = shapely.points(np.array(rows, np.float64))
+            single.append(k)
+    # Nearly all features of a network are points and lines in two dimensions: those are made at once.
+    at = [raw[k]["coordinates"] for k in plain["Point"]]
+    if at and _flat(at):
+        out[plain["Point"]] = shapely.points(np.array(at, np.float64))
+    else:
+        single += plain["Point"]
+    lines = [raw[k]["coordinates"] for k in plain["LineString"]]
+    rows = list(chain.from_iterable(lines))
+    sizes = list(map(len, lines))
+    if lines and min(sizes) > 1 and _flat(rows):
+        owner = np.repeat(np.arange(len(lines)), sizes)
+        out[plain["LineString"]] = shapely.linestrings(np.array(rows, np.float64), indices=owner)
+    else:
+        single += plain["LineString"]
+    for k in sorted(single):
+        one = _One()
+        try:
+            out[k] = one.shape(raw[k])
+        except (ValueError, shapely.errors.GEOSException) as error:
+            refuse(k, str(error))
+        if one.odd or out[k].is_empty:
+            odd[k] = raw[k]
     return out, odd
+
+
+def _flat(rows: list[Any]) -> bool:
+    """Whether these are positions of two numbers each."""
+    return (
+        set(map(type, rows)) == {list}
+        and set(map(len, rows)) == {2}
+        and set(map(type, chain.from_iterable(rows))) <= {int, float}
+    )
 
 
 class _One:

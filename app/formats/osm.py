@@ -1097,6 +1097,6 @@ register(
         needs=Needs(one_of=(frozenset({"objects"}), frozenset({"topology"})), anchor="wgs84"),
         family=FAMILY,
         rank=20,
-        extensions=(".osm", ".osm.xml", ".osm.gz", ".osm.bz2", ".pbf"),
+        extensions=(".osm", "osm.xml", ".osm.gz", ".osm.bz2", ".pbf"),
     )
 )
