@@ -49,10 +49,11 @@ def from_drawing(
     Lines are LineStrings, rings and their collections, whatever their kind; outlines: those of polygons too. Points
     count where their kind is ``poi``: such a node keeps the point's id, place and properties, and takes in vertices
     within ``join`` metres. A vertex is called ``<object id>/<index>`` (counted through the object), an edge
-    ``<a>_<b>``; the first vertex in the objects' order gives a node its id, its exact place and its anchor. Each segment is two edges,
-    one where the line says ``oneway`` (yes, true, 1; or -1 for against the drawing). origins: what ``drawn_from``
-    shall say of each object, by default its id. Distances are measured in ``frame``, or without one and with items on
-    earth in a local frame at the middle of the data. Raises Invalid where lines cover more than that frame can.
+    ``<a>_<b>``; the first vertex in the objects' order gives a node its id, its exact place and its anchor. Each
+    segment is two edges, one where the line says ``oneway`` (yes, true, 1; or -1 for against the drawing). origins:
+    what ``drawn_from`` shall say of each object, by default its id. Distances are measured in ``frame``, or without
+    one and with items on earth in a local frame at the middle of the data. Raises Invalid where lines cover more than
+    that frame can.
     """
     drawing = _Drawing(objects, outlines)
     xy = _metres(drawing, frame)
