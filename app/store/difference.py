@@ -42,25 +42,14 @@ class FeatureChanges:
         }
 
 
-def same_items(a: Item, b: Item) -> bool:
-    """Whether two items are stored as the same bytes: 1 and 1.0 differ."""
-    return (
-        a.anchor == b.anchor
-        and a.wkb == b.wkb
-        and a.properties == b.properties
-        and pack(a.properties) == pack(b.properties)
-    )
-
-
 def fields(a: Item, b: Item) -> list[str]:
     """Names of the properties that differ, ``geometry`` and ``anchor`` among them, sorted."""
+    old, new = a.properties, b.properties
     out = {
         key
-        for key in a.properties.keys() | b.properties.keys()
-        if key not in a.properties
-        or key not in b.properties
-        or a.properties[key] != b.properties[key]
-        or pack(a.properties[key]) != pack(b.properties[key])
+        for key in old.keys() | new.keys()
+        # Packed, since 1 == 1.0 == True to Python.
+        if key not in old or key not in new or old[key] != new[key] or pack(old[key]) != pack(new[key])
     }
     if a.wkb != b.wkb:
         out.add("geometry")
@@ -80,7 +69,7 @@ def features(draft: Draft, a: PartRoot | None, b: PartRoot | None) -> FeatureCha
             after.update(parts.leaf_items(draft, right, anchor))
     return FeatureChanges(
         sorted(after.keys() - before.keys()),
-        sorted(i for i in after.keys() & before.keys() if not same_items(before[i], after[i])),
+        sorted(i for i in after.keys() & before.keys() if before[i] != after[i]),
         sorted(before.keys() - after.keys()),
         before,
         after,

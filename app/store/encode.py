@@ -3,11 +3,13 @@
 A **chunk** is one MessagePack array. Its name is the SHA-256 of these bytes; the database keeps them compressed (zstd),
 so another compressor or level changes no name. The first member is the encoding's version (1), the second its kind:
 
-``[1, "features", ids, cells, geometry, properties]``
+``[1, "features", tail, ids, cells, geometry, sizes, properties]``
     a leaf of vector items in ascending order of (cell, id). ids: array of texts. cells: binary, 8 bytes big-endian an
     item, the z-order cell (below). geometry: array of binaries, ISO WKB, little endian, XY or XYZ, no SRID, no M, no
     negative zero. properties: array of maps with keys in ascending order; integers stay integers and floats stay
-    floats (64 bit), no NaN, no infinity, no negative zero.
+    floats (64 bit), no NaN, no infinity, no negative zero. sizes: binary, 4 bytes little endian an item, bytes of its
+    properties; tail: binary, 4 bytes little endian, bytes of the member ``properties``: with these two an item is
+    found, compared and moved to another leaf without unpacking it.
 ``[1, "ids", ids, places]``
     a leaf of the table id -> place, ascending by the ids' UTF-8. places: binary, 9 bytes an item: 0 for local or 1 for
     wgs84, then the cell.
@@ -61,6 +63,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+import orjson
 import ormsgpack
 import shapely
 import zstandard
@@ -82,6 +85,9 @@ OPTIONS: Final = (
 
 _SUSPECT: Final = re.compile(rb"\xcb(?:[\x7f\xff][\xf0-\xff]|\x80\x00{7})", re.DOTALL)
 """The bytes of a NaN, an infinity or a negative zero, or by chance of something else: then the values are looked at."""
+
+_BINARY: Final = re.compile(rb"[\xc4-\xc6]")
+"""The first byte of a MessagePack binary, or by chance of something else (letters such as č): then JSON decides."""
 
 LEVEL: Final = 1
 MAX_CHUNK: Final = 2**31 - 1
@@ -151,6 +157,12 @@ def pack_value(value: Any, where: str) -> bytes:
     except (TypeError, ValueError, RecursionError) as error:
         reason = f"this cannot be stored: {error}"
         raise Invalid(f"{where}: {reason}", [Problem(reason, where=where)]) from error
+    if _BINARY.search(packed):
+        try:
+            orjson.dumps(value, default=_plain)
+        except TypeError as error:
+            reason = f"this cannot be stored: {error}"
+            raise Invalid(f"{where}: {reason}", [Problem(reason, where=where)]) from error
     if _SUSPECT.search(packed):
         packed = ormsgpack.packb(_normalised(value, where), default=_plain, option=OPTIONS)
     return packed
@@ -163,7 +175,13 @@ def pack_properties(ids: Sequence[str], properties: Sequence[Properties]) -> lis
         packed = [packb(p, default=_plain, option=OPTIONS) for p in properties]
     except (TypeError, ValueError, RecursionError):
         return [pack_value(p, i) for i, p in zip(ids, properties, strict=True)]
-    if _SUSPECT.search(b"".join(packed)):
+    whole = b"".join(packed)
+    if _BINARY.search(whole):
+        try:
+            orjson.dumps(properties, default=_plain)
+        except TypeError:
+            return [pack_value(p, i) for i, p in zip(ids, properties, strict=True)]
+    if _SUSPECT.search(whole):
         packed = [pack_value(properties[k], ids[k]) if _SUSPECT.search(one) else one for k, one in enumerate(packed)]
     return packed
 
@@ -242,6 +260,31 @@ def from_wkb(wkb: Sequence[bytes] | NDArray[np.object_]) -> NDArray[np.object_]:
     column = np.empty(len(wkb), object)
     column[:] = wkb
     return np.asarray(shapely.from_wkb(column), object) if len(column) else column
+
+
+def wkb_bounds(wkb: Sequence[bytes]) -> NDArray[np.float64]:
+    """The boxes of geometries in our own WKB, as ``bounds`` gives them; most shapes need no GEOS for it."""
+    out = np.empty((len(wkb), 4))
+    lengths = np.fromiter(map(len, wkb), np.intp, len(wkb))
+    rest = np.ones(len(wkb), bool)
+    for length, kind, first in ((21, 1, 5), (41, 2, 9)):
+        where = np.flatnonzero(lengths == length)
+        if not len(where):
+            continue
+        rows = np.frombuffer(b"".join([wkb[k] for k in where.tolist()]), np.uint8).reshape(len(where), length)
+        plain = np.ascontiguousarray(rows[:, 1:5]).view("<u4")[:, 0] == kind
+        rows, where = rows[plain], where[plain]
+        xy = np.ascontiguousarray(rows[:, first:]).view("<f8").reshape(len(where), -1, 2)
+        out[where, :2] = xy.min(axis=1)
+        out[where, 2:] = xy.max(axis=1)
+        rest[where] = False
+    others = np.flatnonzero(rest)
+    if len(others):
+        out[others] = bounds(from_wkb([wkb[k] for k in others.tolist()]))
+    nowhere = np.isnan(out).any(axis=1)
+    if nowhere.any():
+        out[nowhere] = NOWHERE
+    return out
 
 
 def bounds(geometry: NDArray[np.object_]) -> NDArray[np.float64]:

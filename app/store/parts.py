@@ -6,11 +6,11 @@ import gc
 import hashlib
 import math
 import threading
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import ormsgpack
@@ -37,6 +37,7 @@ from app.store.encode import (
     pack,
     pack_value,
     unpack,
+    wkb_bounds,
 )
 from app.store.tree import Draft, Node
 from app.store.values import Bounds, Box
@@ -52,7 +53,8 @@ BATCH: Final = 512
 
 TILE_BATCH: Final = 128
 
-_FEATURES_HEAD: Final = array_header(6) + pack(ENCODING) + pack("features")
+_FEATURES_HEAD: Final = array_header(8) + pack(ENCODING) + pack("features") + b"\xc4\x04"
+"""A leaf of vector items up to its tail's four bytes."""
 
 FetchBlobs = Callable[[Sequence[str]], Mapping[str, bytes]]
 
@@ -77,13 +79,18 @@ class Made:
     blobs: Mapping[str, bytes] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class Item:
-    """A stored feature: 0 for local or 1 for wgs84, its WKB, its properties."""
+class Item(NamedTuple):
+    """A stored feature: 0 for local or 1 for wgs84, its WKB, its packed properties. Equal items are equal bytes."""
 
     anchor: int
     wkb: bytes
-    properties: Mapping[str, Any]
+    packed: bytes
+
+    @property
+    def properties(self) -> dict[str, Any]:
+        """The properties, unpacked."""
+        members: dict[str, Any] = ormsgpack.unpackb(self.packed)
+        return members
 
 
 # --- leaves of vector parts ---
@@ -96,9 +103,9 @@ class FeatureLeaf:
 
     def decode(self, raw: bytes) -> tuple[list[bytes], list[tuple[bytes, bytes]]]:
         """A leaf's keys and items."""
-        ids, cells, wkb, properties = _members(raw, "features")
+        ids, cells, wkb, packed = split_leaf(raw)
         keys = [cells[8 * k : 8 * k + 8] + i.encode() for k, i in enumerate(ids)]
-        return keys, [(w, pack(p)) for w, p in zip(wkb, properties, strict=True)]
+        return keys, list(zip(wkb, packed, strict=True))
 
     def encode(self, keys: Sequence[bytes], items: Sequence[tuple[bytes, bytes]]) -> bytes:
         """A leaf's bytes."""
@@ -108,7 +115,7 @@ class FeatureLeaf:
 
     def boxes(self, items: Sequence[tuple[bytes, bytes]]) -> NDArray[np.float64]:
         """The items' boxes."""
-        return bounds(from_wkb([w for w, _ in items]))
+        return wkb_bounds([w for w, _ in items])
 
 
 class IdLeaf:
@@ -131,16 +138,35 @@ class IdLeaf:
 
 def encode_leaf(ids: Sequence[str], cells: bytes, wkb: Sequence[bytes], packed: Sequence[bytes]) -> bytes:
     """A leaf of vector items whose properties are packed already: what MessagePack makes of all of it at once."""
+    sizes = [len(p) for p in packed]
+    header = array_header(len(packed))
     return b"".join(
         [
             _FEATURES_HEAD,
+            (len(header) + sum(sizes)).to_bytes(4, "little"),
             ormsgpack.packb(ids),
             ormsgpack.packb(cells),
             ormsgpack.packb(wkb),
-            array_header(len(packed)),
+            ormsgpack.packb(np.array(sizes, "<u4").tobytes()),
+            header,
             *packed,
         ]
     )
+
+
+def split_leaf(raw: bytes) -> tuple[list[str], bytes, list[bytes], list[bytes]]:
+    """A leaf of vector items: ids, cells, WKB, and properties that stay packed."""
+    start = len(_FEATURES_HEAD)
+    if not raw.startswith(_FEATURES_HEAD):
+        _members(raw, "features")
+        raise Damaged("a stored leaf of vector items has another form than its encoding says")
+    end = len(raw) - int.from_bytes(raw[start : start + 4], "little")
+    # The array without its last member.
+    _, _, _, ids, cells, wkb, sizes = ormsgpack.unpackb(array_header(7) + raw[1:end])
+    ends = np.cumsum(np.frombuffer(sizes, "<u4")).tolist()
+    first = end + len(array_header(len(ids)))
+    packed = [raw[first + a : first + b] for a, b in zip([0, *ends], ends, strict=False)]
+    return ids, cells, wkb, packed
 
 
 def _members(raw: bytes, kind: str) -> list[Any]:
@@ -454,7 +480,7 @@ def feature_bounds(draft: Draft, trees: Mapping[str, Node | None], part: Feature
             geometry = part.geometry[~part.local]
         else:
             (names,) = tree.leaves(draft, [wgs84])
-            wkb = [w for raw in draft.read_many(names).values() for w in _members(raw, "features")[2]]
+            wkb = [w for raw in draft.read_many(names).values() for w in split_leaf(raw)[2]]
             geometry = from_wkb(wkb)
         out["wgs84"] = crossing_box(shapely.get_coordinates(geometry))
     return out
@@ -517,15 +543,13 @@ def find_places(draft: Draft, root: PartRoot, ids: Sequence[str]) -> dict[str, b
     """Sorted ids -> anchor and cell (9 bytes), of those that exist."""
     keys = [i.encode() for i in ids]
     out: dict[str, bytes] = {}
-    leaf = IdLeaf()
     for name in tree.paths(draft, root.trees["ids"], keys):
-        known, places = leaf.decode(draft.read(name))
-        for key in keys[bisect_left(keys, known[0]) :]:
-            if key > known[-1]:
-                break
-            k = bisect_left(known, key)
-            if known[k] == key:
-                out[key.decode()] = places[k]
+        # Code points sort like their UTF-8.
+        known, places = _members(draft.read(name), "ids")
+        for i in ids[bisect_left(ids, known[0]) : bisect_right(ids, known[-1])]:
+            k = bisect_left(known, i)
+            if known[k] == i:
+                out[i] = places[9 * k : 9 * k + 9]
     return out
 
 
@@ -546,8 +570,8 @@ def leaf_items(draft: Draft, names: Sequence[bytes], anchor: int) -> Iterator[tu
         some = names[start : start + BATCH]
         raws = draft.stream(some)
         for name in some:
-            ids, _, wkb, properties = _members(raws[name], "features")
-            for i, w, p in zip(ids, wkb, properties, strict=True):
+            ids, _, wkb, packed = split_leaf(raws[name])
+            for i, w, p in zip(ids, wkb, packed, strict=True):
                 yield i, Item(anchor, w, p)
 
 
@@ -601,10 +625,15 @@ def features_in_box(draft: Draft, root: PartRoot, box: Box, crs: str, frame: Loc
         leaves = tree.select(draft, node, lambda have, coarse=coarse: _meets(have, coarse))  # type: ignore[misc]
         candidates = dict(leaf_items(draft, leaves, anchor))
         ids = list(candidates)
-        geometry = from_wkb([candidates[i].wkb for i in ids])
-        if not same and frame is not None:
-            geometry = frame.geometries_to_local(geometry) if crs == "local" else frame.geometries_to_wgs84(geometry)
-        hits = np.flatnonzero(_meets(bounds(geometry), boxes)) if ids else np.empty(0, np.intp)
+        wkb = [candidates[i].wkb for i in ids]
+        if same or frame is None:
+            have = wkb_bounds(wkb)
+        else:
+            geometry = from_wkb(wkb)
+            have = bounds(
+                frame.geometries_to_local(geometry) if crs == "local" else frame.geometries_to_wgs84(geometry)
+            )
+        hits = np.flatnonzero(_meets(have, boxes)) if ids else np.empty(0, np.intp)
         out.update((ids[k], candidates[ids[k]]) for k in hits.tolist())
     return out
 
@@ -738,7 +767,7 @@ def _load_collections(draft: Draft, roots: Mapping[Any, PartRoot]) -> Iterator[t
         some = todo[start : start + BATCH]
         raws = draft.stream([leaf for _, _, leaf in some])
         for key, name, leaf in some:
-            ids, _, wkb, properties = _members(raws[leaf], "features")
+            _, ids, _, wkb, _, properties = _members(raws[leaf], "features")
             c = columns_of[key]
             c.ids += ids
             c.wkb += wkb

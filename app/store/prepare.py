@@ -27,6 +27,11 @@ MAX_INDEX_ROWS: Final = 2000
 
 def prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
     """A version on top of a base."""
+    with parts.no_garbage_collection():
+        return _prepare(draft, base, changes)
+
+
+def _prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
     entries = {entry.key: entry for entry in base.parts}
     blobs: dict[str, bytes] = {}
     replaced: dict[PartKey, Replace] = {}
