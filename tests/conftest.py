@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+from tests.postgres import postgres_cluster, postgres_url  # noqa: F401  fixtures
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 

@@ -1,0 +1,190 @@
+"""The main job on real maps, through HTTP, on both databases: upload, and get the same information back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+from app.store import Store
+from tests.api.conftest import Api, running, settings_for
+from tests.postgres import Cluster
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+KINDS = {
+    "datum": "datum",
+    "tmap2": "tmap2",
+    "kml": "kml",
+    "kmz": "kmz",
+    "osm_xml": "osm",
+    "occupancy_map_yaml": "occupancy_grid",
+}
+
+REFUSED = {
+    "kml/libkml/billion.kml": "entity expansion attack",
+    "kmz/libkml/bad-too-large.kmz": "declares 4 GiB",
+    "kmz/libkml/nokml.kmz": "no KML in it",
+    "kmz/libkml/overflow_bad_offset.kmz": "damaged archive",
+    **{
+        f"osm/osm-testdata-xml/{name}/data.osm": "must fail, says its own result file"
+        for name in (
+            "101-missing_version",
+            "104-empty_file",
+            "105-incomplete_xml_file",
+            "106-invalid_xml_file",
+            "107-wrongly_nested_xml_file",
+            "109-unknown_data_level",
+            "110-entity_declaration",
+        )
+    },
+}
+UNCOMPARED = {
+    "kml/libkml/all-unknown-input.kml": "the comparator cannot read it; the format's own tests compare the tree"
+}
+
+Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
+
+
+def samples() -> list[Any]:
+    path = SHARED / "data" / "facts.json"
+    if not path.is_file():
+        return [pytest.param("", "", id="absent")]
+    known = json.loads(path.read_text())["files"]
+    return [pytest.param(n, KINDS[e["kind"]], id=n) for n, e in known.items() if e["kind"] in KINDS]
+
+
+@pytest.fixture(scope="module", params=["sqlite", "postgres"])
+def api(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
+    folder = tmp_path_factory.mktemp("server")
+    url = None
+    if request.param == "postgres":
+        cluster: Cluster = request.getfixturevalue("postgres_cluster")
+        url = cluster.url(cluster.create_database())
+        store = Store(url, folder / "blobs")
+        store.migrate()
+        store.close()
+    with running(settings_for(folder, database_url=url)) as server:
+        yield server
+
+
+def files_of(data: Path, name: str, kind: str) -> dict[str, bytes]:
+    path = data / name
+    if kind != "occupancy_grid":
+        return {path.name: path.read_bytes()}
+    found = [p for p in path.parent.rglob("*") if p == path or p.suffix.lower() in (".pgm", ".png")]
+    return {p.relative_to(path.parent).as_posix(): p.read_bytes() for p in found}
+
+
+def served(api: Api, env: str, kind: str) -> dict[str, bytes]:
+    """All files of a map, by the short address a robot uses."""
+    import io
+    import zipfile
+
+    answer = api.get(f"/maps/{env}/{kind}")
+    if answer.headers["content-type"] == "application/zip" and kind != "kmz":
+        with zipfile.ZipFile(io.BytesIO(answer.content)) as z:
+            return {n: z.read(n) for n in z.namelist()}
+    name = answer.headers["content-disposition"].partition('filename="')[2].rstrip('"')
+    return {name: answer.content}
+
+
+@pytest.mark.parametrize(("name", "kind"), samples())
+def test_every_sample_comes_back_with_the_same_information(
+    api: Api, shared: Path, same: Same, name: str, kind: str, request: pytest.FixtureRequest
+) -> None:
+    env = f"s{abs(hash(name)) % 10**12}"
+    api.post("environments", {"name": env})
+    files = files_of(shared / "data", name, kind)
+    if name in REFUSED:
+        problem = api.upload(env, files, expect=None, format=kind)
+        assert 400 <= problem.status_code < 500, REFUSED[name]
+        assert problem.json()["errors"]
+        assert api.get(f"environments/{env}").json()["version"] == 0, "nothing is half stored"
+        return
+    api.upload(env, files, format=kind)
+    sources = api.get(f"environments/{env}/versions/latest/sources").json()
+    assert {s["name"] for s in sources} == set(files)
+    for source in sources[:3]:
+        kept = api.get(f"environments/{env}/versions/latest/sources/{source['name']}")
+        assert kept.content == files[source["name"]], "the original is kept byte for byte"
+    back = served(api, env, kind)
+    if name not in UNCOMPARED:
+        assert same(kind, files, back) == []
+
+
+TEMPLATES = [
+    "indoor-agilex-limo-track",
+    "riseholme_park_farm_general_east_pathway",
+    "riseholme_park_farm_strawberry_polytunnels",
+    "riseholme_park_farm_vineyard",
+]
+
+
+@pytest.mark.parametrize("name", TEMPLATES)
+def test_a_whole_template_folder_is_one_version(api: Api, shared: Path, same: Same, name: str) -> None:
+    root = shared / "data" / "environment_template" / name
+    files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+    env = name.replace("_", "-")
+    api.post("environments", {"name": env})
+    made = api.upload(env, files).json()
+    assert made["version"] == 1
+    assert {s["name"] for s in made["sources"]} == set(files)
+    used = {s["name"] for s in made["sources"] if s["used"]}
+    for grid in {n.split("/")[2] for n in used if n.startswith("config/metric/") and n.endswith(".yaml")}:
+        answer = {
+            n: api.get(f"/maps/{env}/occupancy_grid/{n}?grid={grid}").content for n in (f"{grid}.yaml", f"{grid}.pgm")
+        }
+        original = {n.rpartition("/")[2]: d for n, d in files.items() if f"/metric/{grid}/" in n and n in used}
+        assert same("occupancy_grid", original, answer) == []
+    if any(n.endswith("network.tmap2.yaml") for n in files):
+        network = next(n for n in used if "topological" in n and n.endswith(".tmap2.yaml"))
+        assert same("tmap2", {"a.tmap2.yaml": files[network]}, served(api, env, "tmap2")) == []
+    if any("datum" in n for n in used):
+        site = next(n for n in used if "datum" in n)
+        assert same("datum", {"datum.yaml": files[site]}, served(api, env, "datum")) == []
+
+
+def test_coordinates_agree_with_proj(api: Api, shared: Path, facts_json: dict[str, Any]) -> None:
+    """OSM's nodes in the local frame of a tmap2, against PROJ's own transverse Mercator."""
+    name = "osm/urban-usa-mn-minnesota-zoo/osm.xml"
+    api.post("environments", {"name": "zoo"})
+    made = api.upload("zoo", {"osm.xml": (shared / "data" / name).read_bytes()}).json()
+    counted = facts_json[name]["facts"]
+    nodes = api.get("environments/zoo/versions/1/layers/topology?crs=wgs84").json()["features"]
+    local = api.get("environments/zoo/versions/1/layers/topology?crs=local").json()["features"]
+    assert sum(f["properties"]["kind"] == "node" for f in nodes) == counted["distinct_nodes_used_by_highway_ways"]
+    datum = api.get("environments/zoo").json()["datum"]
+    assert (datum["latitude"], datum["longitude"]) == (44.7644, -93.2073), "the south-west corner of <bounds>"
+    assert any("south-west corner" in w["problem"] for w in made["warnings"])
+    pipe = f"+proj=tmerc +lat_0={datum['latitude']} +lon_0={datum['longitude']} +k=1 +ellps=WGS84"
+    proj = Transformer.from_crs("EPSG:4326", pipe, always_xy=True)
+    place = {f["id"]: f for f in local}
+    earth = np.array([f["geometry"]["coordinates"][:2] for f in nodes if f["properties"]["kind"] == "node"])
+    metres = [place[f["id"]] for f in nodes if f["properties"]["kind"] == "node"]
+    here = np.array([(f.get("place") or f["geometry"])["coordinates"][:2] for f in metres])
+    truth = np.column_stack(proj.transform(earth[:, 0], earth[:, 1]))
+    assert np.abs(here - truth).max() < 1e-6
+
+
+@pytest.mark.parametrize("way", [["kml"], ["geojson"], ["kml", "geojson"], ["geojson", "kml"], ["kmz"]])
+def test_a_network_keeps_every_node_edge_and_attribute_on_the_way(
+    api: Api, shared: Path, same: Same, way: list[str]
+) -> None:
+    """tmap2 → kml, geojson … → tmap2."""
+    path = shared / "data/environment_template/riseholme_park_farm_strawberry_polytunnels/config/topological"
+    original = {"network.tmap2.yaml": (path / "network.tmap2.yaml").read_bytes()}
+    env = "way-" + "-".join(way)
+    datum = {"latitude": 53.268642038, "longitude": -0.524509505881}
+    api.post("environments", {"name": env, "datum": datum})
+    api.upload(env, original)
+    for k, kind in enumerate(way):
+        files = served(api, env, kind)
+        env = f"{env}-{k}"
+        api.post("environments", {"name": env, "datum": datum})
+        api.upload(env, files, format=kind)
+    assert same("tmap2", original, served(api, env, "tmap2")) == []
