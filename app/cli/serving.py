@@ -165,6 +165,7 @@ def with_flags(function: Callable[..., None]) -> Callable[..., None]:
 
 def listen(host: str, port: int) -> socket.socket:
     """A listening socket; Unavailable where the address is taken or not this machine's."""
+    listener: socket.socket | None = None
     try:
         family, kind, protocol, _, place = socket.getaddrinfo(
             host.strip("[]"), port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -174,6 +175,8 @@ def listen(host: str, port: int) -> socket.socket:
         listener.bind(place)
         listener.set_inheritable(True)
     except OSError as error:
+        if listener is not None:
+            listener.close()
         detail = f"cannot listen on {host} port {port}: {error.strerror or error}; choose another with --port or --host"
         raise Unavailable(detail) from error
     return listener
@@ -249,7 +252,8 @@ def _run(settings: Settings, listener: socket.socket) -> None:
     if settings.workers > 1:
         supervisor = Multiprocess(config, sockets=[listener])
         supervisor.run()
-        if any(process.exitcode for process in supervisor.processes):
+        clean = (None, 0, -signal.SIGTERM, -signal.SIGINT)  # uvicorn's workers end by the signal that stopped them
+        if any(process.exitcode not in clean for process in supervisor.processes):
             raise typer.Exit(1)
         return
     server = uvicorn.Server(config)

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,8 @@ from typing import Any
 import pytest
 
 from app.cli import run
+from app.cli.serving import wait_ready
+from app.errors import Unavailable
 
 TOKEN = "administrator-of-the-tests"
 START_SECONDS = 60.0
@@ -84,6 +87,18 @@ class ServerProcess:
     def address(self) -> str:
         return self.wait_for(r"Fleet Map Server: (http://\S+)")[1]
 
+    def ready(self) -> str:
+        """Its address, once it answers; fails at once where it has ended."""
+        address, deadline = self.address, time.monotonic() + START_SECONDS
+        while True:
+            try:
+                wait_ready(address, seconds=1.0)
+            except Unavailable:
+                alive = self.process.poll() is None and time.monotonic() < deadline
+                assert alive, "the server is not ready; printed:\n" + "\n".join(self.lines)
+            else:
+                return address
+
     def stop(self, number: int = signal.SIGTERM, seconds: float = 30.0) -> int:
         """Signal it and wait: its exit status. Whatever is left of its group is killed."""
         if self.process.poll() is None:
@@ -107,17 +122,9 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         "--data-dir", str(folder / "data"), environment={"FLEETMAP_ADMIN_TOKEN": TOKEN}, folder=folder
     )
     try:
-        address = process.address
-        _until_ready(address)
-        yield address
+        yield process.ready()
     finally:
         process.stop()
-
-
-def _until_ready(address: str) -> None:
-    from app.cli.serving import wait_ready
-
-    wait_ready(address, seconds=START_SECONDS)
 
 
 @pytest.fixture

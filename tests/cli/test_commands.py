@@ -88,7 +88,7 @@ def test_a_dry_run_stores_nothing(fleetmap: Fleetmap, network: Path) -> None:
     network.write_text(NETWORK.format(x="9.0"))
     told = fleetmap("import", network, "-e", "rehearsal", "--dry-run")
     assert told.status == 0, told.err
-    assert "1 changed" in told.out
+    assert "topology: 2 changed" in told.out, "the node and the edge that starts at it"
     assert fleetmap("versions", "rehearsal", "--json").json[0]["version"] == 1
 
 

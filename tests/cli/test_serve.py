@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from app.cli.serving import wait_ready
 from tests.cli.conftest import Fleetmap, ServerProcess
 
 
@@ -23,7 +22,7 @@ def test_first_start_prints_a_token_once_and_sigterm_stops_it_cleanly(
 ) -> None:
     process = start(tmp_path, "--workers", workers)
     try:
-        wait_ready(process.address)
+        process.ready()
         token = process.wait_for(r"administrator's token, shown only this once: (\S+)")[1]
         listed = offline("token", "list", "--server", process.address, "--token", token, "--json")
         assert [row["role"] for row in listed.json] == ["admin"]
@@ -31,7 +30,7 @@ def test_first_start_prints_a_token_once_and_sigterm_stops_it_cleanly(
         assert process.stop(signal.SIGTERM) == 0
     again = start(tmp_path, "--workers", workers)
     try:
-        wait_ready(again.address)
+        again.ready()
         assert offline("token", "list", "--server", again.address, "--token", token).status == 0
         assert not any("shown only this once" in line for line in again.lines)
         assert not any(token in line for line in again.lines)
@@ -42,7 +41,7 @@ def test_first_start_prints_a_token_once_and_sigterm_stops_it_cleanly(
 def test_a_given_token_is_used_and_never_printed(tmp_path: Path, offline: Fleetmap) -> None:
     process = start(tmp_path, FLEETMAP_ADMIN_TOKEN="given-by-the-operator")
     try:
-        wait_ready(process.address)
+        process.ready()
         told = offline("token", "list", "--server", process.address, "--token", "given-by-the-operator")
         assert told.status == 0
         assert "given-by-the-operator" not in told.out
@@ -56,7 +55,7 @@ def test_a_mounted_secret_is_a_setting(tmp_path: Path, offline: Fleetmap) -> Non
     (tmp_path / "secrets" / "fleetmap_admin_token").write_text("mounted-as-a-secret\n")
     process = start(tmp_path, FLEETMAP_SECRETS_DIR=str(tmp_path / "secrets"))
     try:
-        wait_ready(process.address)
+        process.ready()
         assert offline("token", "list", "--server", process.address, "--token", "mounted-as-a-secret").status == 0
     finally:
         process.stop()
@@ -67,7 +66,7 @@ def test_the_demo_prints_commands_that_work_at_every_start(tmp_path: Path) -> No
         process = start(tmp_path, "--demo")
         try:
             token = process.wait_for(r"^administrator's token: (\S+)")[1]
-            line = process.wait_for(r"^  curl .*/tmap2")[0]
+            line = process.wait_for(r'^  curl .*/tmap2"$')[0]
             assert token in line
             address = line.split('"')[-2]
             request = urllib.request.Request(address, headers={"Authorization": f"Bearer {token}"})
@@ -115,8 +114,7 @@ def test_every_setting_is_a_flag_but_secrets(offline: Fleetmap, monkeypatch: pyt
 
 def test_workers_end_with_the_process_that_started_them(tmp_path: Path) -> None:
     process = start(tmp_path, "--workers", "2")
-    address = process.address
-    wait_ready(address)
+    address = process.ready()
     process.process.kill()
     process.process.wait(10)
     process._reader.join(30)  # its output ends when the last worker has closed it

@@ -24,11 +24,9 @@ import pytest
 import yaml
 
 from app.cli.serving import wait_ready
-from tests.cli.conftest import Fleetmap, offline
+from tests.cli.conftest import Fleetmap
 
 TOP = Path(__file__).resolve().parents[2]
-
-__all__ = ["offline"]
 
 
 def instructions() -> list[tuple[str, str]]:
