@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 from urllib.parse import quote, urlencode
@@ -43,8 +45,21 @@ def page(request: Request, items: list[Any], cursor: str | None) -> Response:
 
 class _Request(Request):
     async def json(self) -> Any:
-        """The body as JSON: no NaN, no infinity, no lone surrogates, bounded nesting."""
-        return orjson.loads(await self.body())
+        """The body as JSON: no NaN, no infinity, no lone surrogates, no integer beyond 64 bits, bounded nesting."""
+        data = await self.body()
+        value = orjson.loads(data)
+        if _LONG.search(data):  # orjson would take a larger integer as a float
+            json.loads(data, parse_int=_int64)
+        return value
+
+
+_LONG = re.compile(rb"\d{19}")
+
+
+def _int64(text: str) -> int:
+    if len(text) > 20 or not -(2**63) <= int(text) < 2**63:
+        raise json.JSONDecodeError(f"the integer {text[:40]} does not fit into 64 bits", text, 0)
+    return int(text)
 
 
 class Route(APIRoute):

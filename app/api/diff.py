@@ -19,7 +19,7 @@ from app.api.maps import number_of
 from app.api.schemas import VERSION, DiffOut, EnvironmentPath, told
 from app.api.services import Here, Services
 from app.errors import Invalid
-from app.model.features import Features
+from app.model.features import Features, features
 from app.model.frame import Anchor
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
@@ -83,8 +83,7 @@ def _picture(here: Services, old: Version, new: Version) -> bytes:
     delta = here.store.delta_parts(old, new)
     found: list[tuple[tuple[int, int, int], Features]] = []
     for changed in delta.features:
-        gone = here.store.get(old, changed.key, changed.deleted)
-        was = here.store.get(old, changed.key, changed.put.ids)
+        gone, was = _of(here, old, changed.key, changed.deleted), _of(here, old, changed.key, changed.put.ids)
         known = set(was.ids)
         moved = changed.put.take([k for k, i in enumerate(changed.put.ids) if i in known])
         fresh = changed.put.take([k for k, i in enumerate(changed.put.ids) if i not in known])
@@ -115,6 +114,11 @@ def _picture(here: Services, old: Version, new: Version) -> bytes:
     for colour, shapes in drawn:
         view.draw(pen, colour, shapes)
     return _png(image)
+
+
+def _of(here: Services, version: Version, key: PartKey, ids: tuple[str, ...]) -> Features:
+    """Those of the features that the version has."""
+    return here.store.get(version, key, ids) if version.part(key) is not None else features((), "local")
 
 
 def _png(image: Image.Image) -> bytes:

@@ -55,9 +55,10 @@ class Guard:
         here: Services = scope["app"].state.services
         started = time.perf_counter()
         head_only = scope["method"] == "HEAD"
+        scope.setdefault("state", {})
         if head_only:
             # A HEAD is a GET whose body stays here; routes that answer HEAD themselves are told by the state.
-            scope = {**scope, "method": "GET", "state": {**scope.get("state", {}), "head": True}}
+            scope = {**scope, "method": "GET", "state": {**scope["state"], "head": True}}
         answer = _Answer(send, head_only)
         body = _Body(receive, here)
         try:
@@ -73,7 +74,7 @@ class Guard:
         except Exception as error:  # noqa: BLE001  the last place where a bug can become a 500 with a shape
             await self._refuse(problems.of_bug(error), scope, body, answer)
         finally:
-            route = getattr(scope.get("route"), "path", "other")
+            route = scope["state"].get("route") or getattr(scope.get("route"), "path", "other")
             method = scope["method"] if scope["method"] in _METHODS else "other"
             here.metrics.requests.labels(method, route, str(answer.status)).inc()
             here.metrics.seconds.labels(route).observe(time.perf_counter() - started)
@@ -81,7 +82,7 @@ class Guard:
     async def _pass(self, scope: Scope, body: _Body, answer: _Answer, here: Services) -> None:
         headers = _headers(scope)
         if here.options.insecure_no_auth:
-            only_from_here(headers)
+            _only_from_here(headers)
         if not is_open(scope["path"]):
             authorization = headers.get(b"authorization")
             principal = here.access.known(authorization)
@@ -91,7 +92,7 @@ class Guard:
             environment = environment_of(scope["path"])
             if environment is not None:
                 principal.enter(environment)
-            scope.setdefault("state", {})["principal"] = principal
+            scope["state"]["principal"] = principal
         if scope["method"] in _BODY and body.begin(scope, headers):
             await body.preload()
         await self._app(scope, body, answer)
@@ -109,14 +110,19 @@ def _headers(scope: Scope) -> dict[bytes, bytes]:
     return dict(scope["headers"])
 
 
-def only_from_here(headers: dict[bytes, bytes]) -> None:
+def _only_from_here(headers: dict[bytes, bytes]) -> None:
+    if not is_from_here(headers):
+        raise Denied(
+            "without access control the server answers only to a loopback name (localhost, 127.0.0.1), and no pages of "
+            "other sites"
+        )
+
+
+def is_from_here(headers: dict[bytes, bytes]) -> bool:
     """Without tokens a browser must not be led here by a foreign page (DNS rebinding, cross-site requests)."""
     host = urlsplit("//" + headers.get(b"host", b"").decode("latin-1")).hostname
-    if host not in _LOOPBACK:
-        raise Denied("without access control the server answers only to a loopback name (localhost, 127.0.0.1)")
     origin = headers.get(b"origin")
-    if origin is not None and urlsplit(origin.decode("latin-1")).hostname not in _LOOPBACK:
-        raise Denied("without access control the server answers no other site's pages")
+    return host in _LOOPBACK and (origin is None or urlsplit(origin.decode("latin-1")).hostname in _LOOPBACK)
 
 
 class _Answer:

@@ -28,7 +28,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from app.api.access import Access, Principal, Viewer
 from app.api.answers import API, Route, answer, path_of
 from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
-from app.api.guard import only_from_here
+from app.api.guard import is_from_here
 from app.api.jobs import Started, started
 from app.api.metrics import Metrics
 from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, told
@@ -263,7 +263,7 @@ def wanted_of(request: Request) -> Wanted:
 
 
 def _route(request: Request) -> str:
-    return getattr(request.scope.get("route"), "path", "maps")
+    return str(request.scope["state"]["route"])
 
 
 def address_of(request: Request) -> str:
@@ -331,8 +331,8 @@ def _reply(
     who = hot.access.known(authorization)
     if who is None or not who.may_enter(found.wanted.environment):
         return None
-    if hot.access.insecure:
-        only_from_here(dict(headers))
+    if hot.access.insecure and not is_from_here(dict(headers)):
+        return None
     if condition is not None and (condition == found.raw_etag or none_match(condition.decode("latin-1"), found.etag)):
         if found.body is None and condition.strip() == b"*":
             return None
@@ -347,8 +347,9 @@ def _reply(
     return {"type": "http.response.start", "status": 200, "headers": found.headers}, body
 
 
-async def download(request: Request) -> Response:
+async def download(template: str, request: Request) -> Response:
     """A map, or one of its files: the long way."""
+    request.scope["state"]["route"] = template  # for the metrics; plain routes leave none in the scope
     here: Services = request.app.state.services
     who: Principal = request.scope["state"]["principal"]
     found = await here.hot.find(request, here, who)
@@ -428,7 +429,7 @@ def add_routes(app: FastAPI) -> None:
     """The plain routes of maps; documented in ``app.api.openapi``."""
     base = f"{API}/environments/{{env}}/versions/{{v}}/maps/{{format}}"
     for path in (base, base + "/{file:path}", "/maps/{env}/{format}", "/maps/{env}/{format}/{file:path}"):
-        app.router.add_route(path, download, methods=["GET"], include_in_schema=False)
+        app.router.add_route(path, partial(download, path), methods=["GET"], include_in_schema=False)
 
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=Route)

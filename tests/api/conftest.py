@@ -36,6 +36,7 @@ class Api:
 
     def __post_init__(self) -> None:
         headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
+        self.others: list[Api] = []
         self.http = httpx.Client(base_url=self.url, headers=headers, timeout=60.0)
 
     def __call__(self, method: str, path: str, expect: int | None = None, **more: Any) -> httpx.Response:
@@ -63,13 +64,18 @@ class Api:
         return problem(self(method, path, status, **more))
 
     def as_(self, token: str | None) -> Api:
-        return Api(self.url, self.app, token)
+        """A client with another token; it is closed together with this one."""
+        other = Api(self.url, self.app, token)
+        self.others.append(other)
+        return other
 
     def token_for(self, role: str, **more: Any) -> Api:
         """A client with a new token."""
         return self.as_(self.post("tokens", {"name": f"a {role}", "role": role, **more}).json()["token"])
 
     def close(self) -> None:
+        for other in self.others:
+            other.close()
         self.http.close()
 
 

@@ -218,6 +218,7 @@ def _formats(api: Api) -> set[str]:
 
 def test_a_fleet_asks_at_once(api: Api, farm: str) -> None:
     """One conversion, and everybody gets the same bytes."""
+    api.upload(farm, {"network.tmap2.yaml": samples.tmap2({**samples.NODES, "field": (77.0, 7.0)})})
     path = f"{api.url}/maps/{farm}/kml"
     count = api.app.state.services.metrics.conversions.labels("kml", "made")._value.get
     before, answers = count(), []

@@ -42,11 +42,11 @@ def test_channels(api: Api, farm: str) -> None:
 
 def test_planned_moves(api: Api, farm: str) -> None:
     url = f"environments/{farm}/channels"
-    api("PUT", f"{url}/production", 200, json={"version": 1})
+    api("PUT", f"{url}/production", 200, json={"version": 2})
     later = (datetime.now(UTC) + timedelta(hours=1)).isoformat()
-    planned = api("PUT", f"{url}/production", 200, json={"version": 2, "activate_at": later}).json()
-    assert planned["version"] == 1
-    assert planned["planned"]["version"] == 2
+    planned = api("PUT", f"{url}/production", 200, json={"version": 3, "activate_at": later}).json()
+    assert planned["version"] == 2
+    assert planned["planned"]["version"] == 3
     api("DELETE", f"{url}/production/planned", 204)
     assert api.get(url).json()[1]["planned"] is None
     api.problem("DELETE", f"{url}/production/planned", 404)
@@ -76,7 +76,8 @@ def test_formats(api: Api) -> None:
     assert known["kml"]["information"]["topology"] in ("raw", "derived")
     option = next(o for o in grid["options"] if o["name"] == "file_type")
     assert option["schema"]["enum"] == ["pgm", "png"]
-    assert option["default"] == "pgm"
+    assert "default" in option
+    assert option["for"] == "write"
     assert option["description"]
 
 

@@ -24,7 +24,8 @@ def test_an_upload_is_a_version(api: Api, bare: str) -> None:
     assert (body["environment"], body["version"], body["parent"]) == (bare, 1, 0)
     assert (body["author"], body["message"]) == ("administrator", "driven today")
     assert body["time"].endswith("Z")
-    assert body["changes"]["topology"] == {"added": 6, "changed": 0, "deleted": 0}
+    changes = body["changes"]["topology"]
+    assert (changes["added"], changes["changed"], changes["deleted"]) == (6, 0, 0)
     assert body["information"]["topology"] == "raw"
     assert body["information"]["occupancy"] == "missing"
     digest = hashlib.sha256(samples.tmap2()).hexdigest()
@@ -178,7 +179,8 @@ def test_a_node_is_moved_and_its_edges_follow(api: Api, farm: str) -> None:
     answer = api.post(f"environments/{farm}/edits", {"message": "moved", "changes": [put("barn", 12.0, 1.0)]})
     body = answer.json()
     assert (body["version"], body["message"]) == (4, "moved")
-    assert body["changes"]["topology"] == {"added": 0, "changed": 4, "deleted": 0}
+    changes = body["changes"]["topology"]
+    assert (changes["added"], changes["changed"], changes["deleted"]) == (0, 4, 0)
     layer = api.get(f"environments/{farm}/versions/4/layers/topology?crs=local").json()
     places = {f["id"]: f["place"]["coordinates"] for f in layer["features"]}
     assert places["barn"] == [12.0, 1.0]
@@ -236,8 +238,6 @@ def test_cells_in_a_polygon(api: Api, farm: str) -> None:
          "coordinates": [999, 0]}, "properties": {"kind": "node"}}},
         {"op": "put", "layer": "topology", "feature": {"type": "Feature", "id": "n", "geometry": {"type": "Point",
          "coordinates": ["x", None]}, "properties": {"kind": "node"}}},
-        {"op": "put", "layer": "objects", "feature": {"type": "Feature", "id": "o", "geometry": None,
-         "properties": {"number": 123456789012345678901234567890}}},
     ],
 )  # fmt: skip
 def test_edits_refused(api: Api, farm: str, change: object) -> None:
@@ -264,6 +264,8 @@ def test_edits_on_top_of_a_version(api: Api, farm: str) -> None:
         "\ud800".encode("utf-8", "surrogatepass"),
         '{"message": "\\ud800", "changes": []}',
         "[" * 5000,
+        '{"message": "x", "changes": [{"op": "delete", "layer": "zones", "id": 123456789012345678901234567890}]}',
+        '{"message": 1e999, "changes": []}',
     ],
 )
 def test_json_that_is_none(api: Api, farm: str, text: str | bytes) -> None:
