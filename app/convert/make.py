@@ -62,7 +62,8 @@ def write(
         "format": known.name,
         "layers": _told(used, layers, way, entries or {}, origin or {}),
         "template": context.template,
-        "dropped": context.dropped + _not_carried(known, entries, layers),
+        # What a stored version holds beside this map is not part of the recipe's key: ``Maps.report`` adds it.
+        "dropped": context.dropped + (not_carried(known, None, layers) if entries is None else []),
         "warnings": [p.as_dict() for p in context.warnings],
     }
     return Written(files, report)
@@ -113,7 +114,7 @@ def _told(
     return out
 
 
-def _not_carried(known: Format, entries: Mapping[PartKey, PartEntry] | None, layers: Layers) -> list[dict[str, Any]]:
+def not_carried(known: Format, entries: Mapping[PartKey, PartEntry] | None, layers: Layers) -> list[dict[str, Any]]:
     """Stored layers that this format has no words for."""
     counts: dict[str, int] = {}
     if entries is not None:

@@ -16,6 +16,7 @@ from app.convert.recipe import Recipe
 from app.errors import Ambiguous, CannotConvert, FleetMapError, UnreadableFile
 from app.formats import Limits
 from app.model.frame import Datum
+from app.model.layers import Layers
 from app.pool import WorkerDied
 from app.store import Store
 from app.store.values import Version
@@ -58,7 +59,9 @@ class Maps:
             if known is not None:
                 line = {**line, "information": known.information, "sources": list(known.sources)}  # noqa: PLW2901
             lines.append(line)
-        return {**told, "version": recipe.version.number, "layers": lines}
+        stored = {e.key: e for e in recipe.version.parts}
+        dropped = told["dropped"] + making.not_carried(recipe.format, stored, Layers())
+        return {**told, "version": recipe.version.number, "layers": lines, "dropped": dropped}
 
     def coverage(self, version: Version) -> list[dict[str, Any]]:
         """For every format that can be served: direct, derivable or missing, by which chain, and what to supply."""
