@@ -268,7 +268,7 @@ def placed(
     if datum is not None and local.any():
         geometry[local] = local_frame(datum).geometries_to_wgs84(geometry[local])
     boxes = bounds(geometry)
-    wkb = to_wkb(geometry)
+    wkb = to_wkb(np.asarray(shapely.force_2d(geometry), object))  # the index is a map seen from above
     out = []
     for k in np.flatnonzero(np.isfinite(boxes).all(axis=1)).tolist():
         west, south, east, north = boxes[k].tolist()
