@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
+import shapely
 
 from app.errors import Invalid, NotFound
 from app.model.frame import Datum, Level
