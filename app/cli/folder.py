@@ -18,10 +18,18 @@ from app.cli.client import LocalFile
 from app.errors import Invalid
 
 CONFIG = "config"
+PARTS = ("location", "metric", "topological", "world")
+"""The folders of an environment_template's config; the same as ``app.bundle.TEMPLATE_FOLDERS``, without its imports."""
+
 SCRIPTS = ("environment.sh", "properties.sh")
 """Read as literal assignments by the server; never run."""
 
 SKIPPED = frozenset({".git", ".svn", ".hg", "__pycache__", "node_modules", ".DS_Store"})
+
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
+RESERVED = frozenset({"robots", "server"})
+"""What an environment may be called; the same as in ``app.store.base``, without its imports."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,13 +64,10 @@ def environment_name(text: str) -> str:
 
     Invalid where nothing is left or the name is reserved.
     """
-    from app.store.base import check_environment_name
-
     name = re.sub(r"[^a-z0-9_-]+", "-", text.lower()).strip("-_")[:63].rstrip("-_")
-    try:
-        return check_environment_name(name)
-    except Invalid as error:
-        raise Invalid(f"{text!r} makes no name for an environment: give one with --environment") from error
+    if not NAME.fullmatch(name) or name in RESERVED:
+        raise Invalid(f"{text!r} makes no name for an environment: give one with --environment")
+    return name
 
 
 def single(path: Path, name: str | None = None) -> LocalFile:
@@ -80,9 +85,7 @@ def _template(folder: Path) -> tuple[Path, Path | None]:
 
 
 def _is_config(folder: Path) -> bool:
-    from app.bundle import TEMPLATE_FOLDERS
-
-    return folder.is_dir() and any((folder / part).is_dir() for part in TEMPLATE_FOLDERS)
+    return folder.is_dir() and any((folder / part).is_dir() for part in PARTS)
 
 
 def _walk(folder: Path, root: Path, notes: list[str]) -> Iterator[Path]:

@@ -142,10 +142,17 @@ def summary(changes: Mapping[str, Any]) -> str:
 
 
 def counts(change: Any) -> str:
-    """Counts of one change in a few words: ``2 added, 1 deleted``."""
+    """One change in a few words: ``2 added, 1 deleted``. Boxes and zeros are left out."""
     if not isinstance(change, Mapping):
         return str(change)
-    parts = [f"{k} ({counts(v)})" if isinstance(v, Mapping) else f"{v} {k}" for k, v in change.items() if v]
+    parts = []
+    for name, value in change.items():
+        if isinstance(value, Mapping):
+            parts.append(f"{name} ({counts(value)})")
+        elif isinstance(value, float):
+            parts.append(f"{name} {value:.7g}")
+        elif value and not isinstance(value, list):
+            parts.append(name if value is True else f"{value} {name}")
     return ", ".join(parts) or "unchanged"
 
 

@@ -92,3 +92,12 @@ def test_a_folder_name_becomes_valid(text: str, name: str) -> None:
 def test_a_name_that_cannot_be_used_asks_for_another(text: str) -> None:
     with pytest.raises(Invalid, match="--environment"):
         folder.environment_name(text)
+
+
+def test_names_and_folders_are_those_of_the_server() -> None:
+    from app import bundle
+    from app.store import base
+
+    assert folder.PARTS == bundle.TEMPLATE_FOLDERS
+    assert folder.NAME.pattern == base.ENVIRONMENT_NAME.pattern
+    assert folder.RESERVED == base.RESERVED
