@@ -11,7 +11,7 @@ from typing import Any
 
 from app import derive, formats
 from app.convert.recipe import Chain
-from app.errors import Problem
+from app.errors import FleetMapError, Problem
 from app.formats import Format, WriteContext, _archive
 from app.model.features import Features
 from app.model.layers import LAYERS, Layers, PartKey
@@ -43,6 +43,16 @@ def make(
     layers = Layers(loaded.parts, version.datum, version.levels)
     entries = {e.key: e for e in version.parts}
     return write(known, layers, values, way, entries)
+
+
+def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) -> str | None:
+    """In a worker: why the derivations of a chain fail on a version's content, or None where they work."""
+    loaded = open_store(database_url, blob_dir).load(version, way.keys)
+    try:
+        derive.run(way.steps, Layers(loaded.parts, version.datum, version.levels))
+    except FleetMapError as error:
+        return error.detail
+    return None
 
 
 def write(

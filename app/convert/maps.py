@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,10 @@ Run = Callable[..., Any]
 """``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""
 
 
+TRIED = 1000
+"""Of how many derivations it is remembered whether they work on some content."""
+
+
 class Maps:
     """Maps of stored versions, made on demand in worker processes and kept by content."""
 
@@ -33,12 +38,24 @@ class Maps:
     ) -> None:
         self._store, self._run, self._limits = store, run, limits
         self.cache = Cache(cache_dir, cache_bytes)
+        self._tried: dict[Any, str | None] = {}
+        self._guard = threading.Lock()
 
     def recipe(
-        self, version: Version, name: str, values: Mapping[str, str] | None = None, *, derive: bool = True
+        self,
+        version: Version,
+        name: str,
+        values: Mapping[str, str] | None = None,
+        *,
+        derive: bool = True,
+        file: str | None = None,
     ) -> Recipe:
-        """How the map would be made; cheap. Raises NotFound, Invalid, MissingLayer, MissingDatum, Ambiguous."""
-        return recipes.recipe(version, name, values or {}, derived=derive)
+        """How the map would be made; cheap. Raises NotFound, Invalid, MissingLayer, MissingDatum, Ambiguous.
+
+        file: the one file of the map that is wanted; its name may say more (``keepout.yaml`` is the grid keepout).
+        """
+        said = formats.get_format(name).by_file(file) if file else {}
+        return recipes.recipe(version, name, {**said, **(values or {})}, derived=derive)
 
     def ready(self, recipe: Recipe) -> Made | None:
         """The map, only if it is made already."""
@@ -78,10 +95,32 @@ class Maps:
             except FleetMapError as error:
                 line["missing"] = recipes.missing(known, available) or [error.detail]
             else:
-                line["state"] = "derivable" if way.steps else "direct"
-                line["chain"] = [_step(step) for step in way.steps]
+                hindrance = self._hindrance(version, way) if way.steps else None
+                if hindrance is None:
+                    line["state"] = "derivable" if way.steps else "direct"
+                    line["chain"] = [_step(step) for step in way.steps]
+                else:
+                    line["missing"] = [*recipes.missing(known, available), hindrance]
             out.append(line)
         return out
+
+    def _hindrance(self, version: Version, way: recipes.Chain) -> str | None:
+        """Why a derivation would not work on what is stored, found by doing it once for each content."""
+        entries = {e.key: e.hash for e in version.parts}
+        key = (way.steps, version.datum, tuple((k, entries[k]) for k in way.keys))
+        with self._guard:
+            if key in self._tried:
+                return self._tried[key]
+        where = (self._store.database_url, str(self._store.blob_dir))
+        try:
+            found: str | None = self._run(making.hindrance, *where, version, way)
+        except WorkerDied as error:
+            found = error.detail
+        with self._guard:
+            self._tried[key] = found
+            while len(self._tried) > TRIED:
+                self._tried.pop(next(iter(self._tried)))
+        return found
 
     def convert(
         self,
