@@ -5,18 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import fcntl
-import itertools
 import logging
 import os
 import shutil
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import uvicorn
-from fastapi import APIRouter, FastAPI
+from fastapi import APIRouter
 from fastapi.exceptions import RequestValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -42,7 +41,7 @@ from app.api.access import Access
 from app.api.answers import API
 from app.api.guard import Guard
 from app.api.jobs import BEAT_SECONDS, Work
-from app.api.maps import Front, Hot
+from app.api.maps import Hot, Server
 from app.api.metrics import Metrics
 from app.api.protocol import BoundedProtocol
 from app.api.services import ApiOptions, Services
@@ -66,23 +65,25 @@ COLLECT_GRACE = timedelta(hours=6)
 WARM = ("app.ingest.prepare", "app.convert.make", "app.convert.files")
 
 
-def create_app(settings: Settings) -> FastAPI:
+def create_app(settings: Settings) -> Server:
     """The application. Its lifespan opens the store and starts the workers, and closes both."""
 
     @contextlib.asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(app: Server) -> AsyncIterator[None]:
         here = await run_in_threadpool(open_services, settings)
         app.state.services = here
+        app.hot = here.hot
         ticker = asyncio.create_task(_tick(here))
         try:
             yield
         finally:
+            app.hot = None
             ticker.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await ticker
             await run_in_threadpool(close_services, here)
 
-    app = FastAPI(
+    app = Server(
         title="Fleet Map Server",
         version=__version__,
         lifespan=lifespan,
@@ -95,7 +96,6 @@ def create_app(settings: Settings) -> FastAPI:
     app.add_exception_handler(HTTPException, problems.handle_http)
     app.add_exception_handler(RequestValidationError, problems.handle_validation)
     app.add_middleware(Guard)
-    app.add_middleware(Front)  # added last: it stands in front
     maps.add_routes(app)
     openapi.add_pages(app)
     api = APIRouter(prefix=API)
@@ -106,7 +106,7 @@ def create_app(settings: Settings) -> FastAPI:
     return app
 
 
-def from_environment() -> FastAPI:
+def from_environment() -> Server:
     """For ``uvicorn --factory app.main:from_environment`` and for worker processes."""
     return create_app(Settings())
 
@@ -212,16 +212,10 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         maps=service,
         access=access,
         work=Work(store, service, settings.job_seconds, count),
-        hot=Hot(settings.memory_cache_bytes, access, metrics, _generation(store)),
+        hot=Hot(settings.memory_cache_bytes, access, metrics, store.generation),
         intake=intake,
         metrics=metrics,
     )
-
-
-def _generation(store: Any) -> Callable[[], int]:
-    count = itertools.count()
-    found: Callable[[], int] = getattr(store, "generation", lambda: next(count))
-    return found
 
 
 def close_services(here: Services) -> None:
@@ -261,6 +255,7 @@ async def _tick(here: Services) -> None:
         await asyncio.sleep(TICK_SECONDS)
         beat += TICK_SECONDS
         try:
+            here.hot.count()
             await run_in_threadpool(here.store.apply_due, datetime.now(UTC))
             if beat >= BEAT_SECONDS:
                 beat = 0.0

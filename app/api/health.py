@@ -44,9 +44,10 @@ async def readyz(request: Request) -> Response:
     response_class=Response,
     responses={200: {"description": "Prometheus text format", "content": {"text/plain": {}}}},
 )
-def metrics(here: Here, who: Viewer) -> Response:
+async def metrics(here: Here, who: Viewer) -> Response:
     """Requests, conversions, cache hits, heads. Takes a token for all environments."""
     who.demand_everywhere()
-    response = Response(here.metrics.render(here.store))
+    here.hot.count()
+    response = Response(await run_in_threadpool(here.metrics.render, here.store))
     response.headers["content-type"] = CONTENT_TYPE
     return response

@@ -1,6 +1,6 @@
 """Maps as robots fetch them: plain routes over an LRU of answers, so that a fleet that asks again costs microseconds.
 
-``Front`` stands before everything else and answers what it has in memory: an answer is believed while
+``Server`` first answers what it has in memory: an answer is believed while
 ``Store.generation()`` stays the same and for a second at most, the caller's token likewise. All else goes the long
 way: guard, route, recipe (the ETag), cache on disk, conversion.
 """
@@ -23,7 +23,7 @@ from fastapi import APIRouter, FastAPI, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.responses import Response, StreamingResponse
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Receive, Scope, Send
 
 from app.api.access import Access, Principal, Viewer
 from app.api.answers import API, Route, answer, path_of
@@ -75,8 +75,7 @@ class Resource:
     path: Path | None
     generation: int
     fresh_until: float
-    ok: Any
-    not_modified: Any
+    tally: list[int]
 
 
 class Hot:
@@ -88,7 +87,7 @@ class Hot:
         self._entries: OrderedDict[Key, Resource] = OrderedDict()
         self._resolving: dict[Key, asyncio.Future[Recipe]] = {}
         self._lock = threading.Lock()
-        self.hit = metrics.memory_hits.inc
+        self._tallies: dict[str, list[int]] = {}
 
     def get(self, key: Key) -> Resource | None:
         """What is known to stand there at this moment."""
@@ -165,14 +164,20 @@ class Hot:
             (b"cache-control", b"no-cache"),
             (b"fleetmap-version", str(version.number).encode()),
             (b"fleetmap-root", version.root.encode()),
-            (b"link", f'<{report}{"?" + query if query else ""}>; rel="describedby"'.encode()),
-            (b"x-content-type-options", b"nosniff"),
         ]
-        count = self._metrics.requests.labels
-        ok, not_modified = count("GET", route, "200").inc, count("GET", route, "304").inc
-        return Resource(
-            wanted, recipe, etag, etag.encode(), [], bare, 0, None, None, generation, until, ok, not_modified
-        )
+        link = f'<{report}{"?" + query if query else ""}>; rel="describedby"'.encode()
+        headers = [*bare, (b"link", link), (b"x-content-type-options", b"nosniff")]
+        tally = self._tallies.setdefault(route, [0, 0])
+        return Resource(wanted, recipe, etag, etag.encode(), headers, bare, 0, None, None, generation, until, tally)
+
+    def count(self) -> None:
+        """Add what was answered from memory since the last call to the metrics."""
+        for route, tally in list(self._tallies.items()):
+            for place, status in enumerate(("200", "304")):
+                new, tally[place] = tally[place], 0
+                if new:
+                    self._metrics.requests.labels("GET", route, status).inc(new)
+                    self._metrics.memory_hits.inc(new)
 
     def _put(self, key: Key, resource: Resource) -> None:
         with self._lock:
@@ -204,7 +209,7 @@ def _matches(request: Request, etag: str) -> bool:
 
 
 def _resolve(here: Services, wanted: Wanted, values: Mapping[str, str], derive: bool) -> Recipe:
-    return here.maps.recipe(version_of(here, wanted), wanted.format, values, derive=derive)
+    return here.maps.recipe(version_of(here, wanted), wanted.format, values, derive=derive, file=wanted.file)
 
 
 def version_of(here: Services, wanted: Wanted) -> Version:
@@ -233,7 +238,7 @@ def _filled(empty: Resource, made: Made) -> Resource:
         (b"content-type", _media_type(file).encode()),
         (b"accept-ranges", b"bytes"),
         (b"content-disposition", content_disposition(file.name).encode()),
-        *empty.bare,
+        *empty.headers,
     ]
     if file.size > IN_MEMORY:
         return replace(empty, headers=headers, size=file.size, path=file.path)
@@ -289,26 +294,26 @@ def _options(query: bytes) -> tuple[dict[str, str], bool]:
     return values, derive == "true"
 
 
-class Front:
-    """ASGI middleware that answers repeated requests for maps from memory."""
+class Server(FastAPI):
+    """The application, with the answers it has in memory in front of everything else.
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
+    ``hot`` is None until the services are open.
+    """
+
+    hot: Hot | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer from memory, or pass on."""
-        if scope["type"] == "http":
-            method = scope["method"]
-            if method in ("GET", "HEAD"):
-                hot: Hot = scope["app"].state.services.hot
-                found = hot.get((scope.get("raw_path") or b"", scope["query_string"]))
-                if found is not None:
-                    reply = _reply(hot, found, scope["headers"], method == "HEAD")
-                    if reply is not None:
-                        await send(reply[0])
-                        await send(reply[1])
-                        return
-        await self._app(scope, receive, send)
+        """Answer a repeated request for a map from memory, or go the long way."""
+        hot = self.hot
+        if hot is not None and scope["type"] == "http" and scope["method"] in ("GET", "HEAD"):
+            found = hot.get((scope.get("raw_path") or b"", scope["query_string"]))
+            if found is not None:
+                reply = _reply(hot, found, scope["headers"], scope["method"] == "HEAD")
+                if reply is not None:
+                    await send(reply[0])
+                    await send(reply[1])
+                    return
+        await super().__call__(scope, receive, send)
 
 
 _EMPTY = {"type": "http.response.body", "body": b""}
@@ -336,13 +341,11 @@ def _reply(
     if condition is not None and (condition == found.raw_etag or none_match(condition.decode("latin-1"), found.etag)):
         if found.body is None and condition.strip() == b"*":
             return None
-        hot.hit()
-        found.not_modified()
+        found.tally[1] += 1
         return {"type": "http.response.start", "status": 304, "headers": found.bare}, _EMPTY
     if found.body is None:
         return None
-    hot.hit()
-    found.ok()
+    found.tally[0] += 1
     body = _EMPTY if head_only else {"type": "http.response.body", "body": found.body}
     return {"type": "http.response.start", "status": 200, "headers": found.headers}, body
 
