@@ -23,6 +23,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from app.errors import FleetMapError, TooLarge, Unavailable
+from app.sandbox import Allowed, confine
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +41,11 @@ class _Worker:
 
 
 class Pool:
-    """At most ``workers`` jobs at once, ``waiting`` more in line; a further one is told to come again later."""
+    """At most ``workers`` jobs at once, ``waiting`` more in line; a further one is told to come again later.
+
+    memory_bytes: address space of a worker. seconds: longest time of a job. warm: modules that a worker imports before
+    its first job. allowed: what a worker may do besides computing and reading; None: everything.
+    """
 
     def __init__(
         self,
@@ -50,8 +55,9 @@ class Pool:
         seconds: float = 300.0,
         waiting: int = 64,
         warm: tuple[str, ...] = (),
+        allowed: Allowed | None = None,
     ) -> None:
-        self._memory_bytes, self._seconds, self._warm = memory_bytes, seconds, warm
+        self._memory_bytes, self._seconds, self._warm, self._allowed = memory_bytes, seconds, warm, allowed
         self._slots = threading.BoundedSemaphore(workers + waiting)
         self._idle: queue.LifoQueue[_Worker | None] = queue.LifoQueue()
         self._workers: dict[int, _Worker] = {}
@@ -103,7 +109,7 @@ class Pool:
 
     def _new(self) -> _Worker:
         ours, theirs = _spawn.Pipe()
-        arguments = (theirs, os.getpid(), self._memory_bytes, self._warm)
+        arguments = (theirs, os.getpid(), self._memory_bytes, self._warm, self._allowed)
         process = _spawn.Process(target=_work, args=arguments, daemon=True, name="fleetmap-worker")
         process.start()
         theirs.close()
@@ -136,8 +142,10 @@ def _ask(worker: _Worker, function: Callable[..., Any], args: tuple[Any, ...], s
     return ok, value
 
 
-def _work(pipe: Connection, parent: int, memory_bytes: int, warm: tuple[str, ...]) -> None:
+def _work(pipe: Connection, parent: int, memory_bytes: int, warm: tuple[str, ...], allowed: Allowed | None) -> None:
     """A worker's life: take a job, answer, until the parent closes the pipe or dies."""
+    if allowed is not None:
+        confine(allowed)  # before any thread is started: those that exist already would stay free
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if memory_bytes:
         resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -13,8 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from app import sandbox
 from app.errors import NotFound, Problem, TooLarge, Unavailable
 from app.pool import Pool, WorkerDied
+from app.sandbox import Allowed
 
 
 def work_double(x: int) -> int:
@@ -26,7 +29,7 @@ def work_refuse() -> None:
 
 
 def work_bug() -> None:
-    {}["missing"]  # noqa: B018
+    {}["missing"]
 
 
 def work_crash() -> None:
@@ -36,6 +39,20 @@ def work_crash() -> None:
 def work_sleep(seconds: float) -> int:
     time.sleep(seconds)
     return os.getpid()
+
+
+def work_write(path: str, text: str) -> str:
+    Path(path).write_text(text)
+    return Path(path).read_text()
+
+
+def work_call(port: int) -> str:
+    with socket.create_connection(("127.0.0.1", port), timeout=5) as s:
+        return str(s.getpeername()[1])
+
+
+def work_execute() -> bytes:
+    return subprocess.run(["/bin/true"], check=True, capture_output=True).stdout
 
 
 def work_eat() -> int:
@@ -125,3 +142,37 @@ def test_a_worker_ends_with_a_killed_parent(tmp_path: Path) -> None:
     pytest.fail("the worker outlived its parent")
 
 
+@pytest.fixture
+def confined(tmp_path: Path) -> Iterator[Pool]:
+    (tmp_path / "scratch").mkdir()
+    (tmp_path / "database").mkdir()
+    (tmp_path / "database" / "a-shm").write_text("old")
+    made = Pool(1, allowed=Allowed((tmp_path / "scratch",), (tmp_path / "database",), ()))
+    yield made
+    made.close()
+
+
+needs_landlock = pytest.mark.skipif(sandbox.supported() < 4, reason="the kernel has no Landlock with network rules")
+
+
+@needs_landlock
+def test_a_confined_worker_writes_only_where_it_may(confined: Pool, tmp_path: Path) -> None:
+    assert confined.run(work_write, str(tmp_path / "scratch" / "a"), "x") == "x"
+    assert confined.run(work_write, str(tmp_path / "database" / "a-shm"), "new") == "new"
+    for forbidden in ("database/other", "elsewhere"):
+        with pytest.raises(RuntimeError, match="PermissionError"):
+            confined.run(work_write, str(tmp_path / forbidden), "x")
+        assert not (tmp_path / forbidden).exists()
+
+
+@needs_landlock
+def test_a_confined_worker_has_no_network_and_starts_no_program(confined: Pool) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with pytest.raises(RuntimeError, match="PermissionError"):
+            confined.run(work_call, port)
+        free = Pool(1, allowed=Allowed(ports=(port,)))
+        assert free.run(work_call, port) == str(port)
+        free.close()
+    with pytest.raises(RuntimeError, match="PermissionError"):
+        confined.run(work_execute)
