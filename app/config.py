@@ -45,7 +45,6 @@ class Settings(BaseSettings):
     workers: int = Field(default=1, ge=1, le=256, description="Processes that answer requests.")
     admin_token: SecretStr | None = Field(
         default=None,
-        min_length=8,
         description="A first administrator's token, for containers and tests; use 32 random characters or more. "
         "Without it the first start makes one and prints it once.",
     )

@@ -50,8 +50,9 @@ def test_a_map_of_several_files(api: Api, farm: str) -> None:
             single = api.get(f"{base}/{name}")
             assert single.content == archive.read(name)
             assert single.headers["etag"] != answer.headers["etag"]
-    problem_ = api.problem("GET", f"{base}/other.yaml", 404)
-    assert "map.yaml" in problem_["detail"]
+    assert "map" in api.problem("GET", f"{base}/other.yaml", 404)["detail"]
+    other = api.problem("GET", f"environments/{farm}/versions/latest/maps/tmap2/other.yaml", 404)
+    assert "network.tmap2.yaml" in other["detail"]
     api.problem("GET", f"{base}/{quote('../map.yaml', safe='')}", 404)
 
 

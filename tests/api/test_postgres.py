@@ -1,0 +1,77 @@
+"""The same interface on PostgreSQL with PostGIS: one pass through everything that touches the database."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from app.errors import Unavailable
+from app.main import open_services
+from app.store import Store
+from tests.api import samples
+from tests.api.conftest import Api, running, settings_for
+from tests.postgres import postgres_cluster, postgres_url
+
+__all__ = ["postgres_cluster", "postgres_url"]
+
+pytestmark = pytest.mark.postgres
+
+
+@pytest.fixture
+def api(postgres_url: str, tmp_path: Path) -> Iterator[Api]:
+    """A server on a database that ``fleetmap migrate`` has prepared."""
+    settings = settings_for(tmp_path, database_url=postgres_url)
+    settings.blob_dir.mkdir(parents=True)
+    store = Store(settings.database, settings.blob_dir)
+    store.migrate()
+    store.close()
+    with running(settings) as api:
+        yield api
+
+
+def test_a_server_does_not_start_before_migrate(postgres_url: str, tmp_path: Path) -> None:
+    with pytest.raises(Unavailable, match="fleetmap migrate"):
+        open_services(settings_for(tmp_path, database_url=postgres_url))
+
+
+def test_the_whole_way(api: Api) -> None:
+    assert api.get("/readyz").json()["status"] == "ready"
+    api.post("environments", {"name": "farm", "tags": ["wheat"]})
+    api.upload("farm", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2()}, headers={"Idempotency-Key": "k"})
+    again = api.upload(
+        "farm", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2()}, headers={"Idempotency-Key": "k"}
+    )
+    assert again.json()["version"] == 1
+    first = api.get("/maps/farm/tmap2")
+    assert first.headers["fleetmap-version"] == "1"
+    node = {"type": "Feature", "id": "new", "geometry": None, "place": {"type": "Point", "coordinates": [2.0, 1.0]}}
+    put = {"op": "put", "layer": "topology", "feature": {**node, "properties": {"kind": "node"}}}
+    api.post("environments/farm/edits", {"changes": [put]}, headers={"If-Match": '"1"'})
+    api.problem("POST", "environments/farm/edits", 412, json={"changes": [put]}, headers={"If-Match": '"1"'})
+    second = api.get("/maps/farm/tmap2")
+    assert second.headers["fleetmap-version"] == "2"
+    assert b"new" in second.content
+    assert api.get("environments/farm/diff").json()["layers"]["topology"]["added"] == ["new"]
+    near = api.get("environments/farm/versions/2/layers/topology?crs=local&bbox=1.5,0.5,2.5,1.5").json()["features"]
+    assert {f["id"] for f in near} >= {"new"}
+    assert [e["name"] for e in api.get("environments?contains=53.2687,-0.5246").json()] == ["farm"]
+    assert api.get("environments?bbox=10,10,11,11").json() == []
+    api("PUT", "environments/farm/channels/production", 200, json={"version": 1})
+    assert api.get("/maps/farm/tmap2").headers["etag"] == first.headers["etag"]
+    api.post("environments/farm/versions", {"revert_to": 1})
+    assert (
+        api.get("environments/farm/versions/3").json()["root"] == api.get("environments/farm/versions/1").json()["root"]
+    )
+    assert api.get("environments/farm/versions/1/sources/n.tmap2.yaml").content == samples.tmap2()
+    viewer = api.token_for("viewer", environments="farm")
+    viewer.get("/maps/farm/kml")
+    viewer.problem("DELETE", "environments/farm", 403)
+    api.post("environments", {"name": "copy", "clone": {"environment": "farm"}})
+    assert 'fleetmap_head{environment="farm"} 3.0' in api.get("/metrics").text
+    api("DELETE", "environments/farm", 204)
+    api.problem("GET", "/maps/farm/tmap2", 404)
+    api.post("environments/farm/purge", expect=204)
+    assert [e["name"] for e in api.get("environments").json()] == ["copy"]
+    assert api.get("/maps/copy/tmap2").content == first.content
