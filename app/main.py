@@ -17,6 +17,7 @@ from typing import Any
 import uvicorn
 from fastapi import APIRouter
 from fastapi.exceptions import RequestValidationError
+from sqlalchemy.engine import make_url
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
@@ -51,6 +52,7 @@ from app.convert import Maps
 from app.errors import FleetMapError, Unavailable
 from app.ingest import Ingest
 from app.pool import Pool
+from app.sandbox import Allowed
 from app.store import Store
 
 log = logging.getLogger(__name__)
@@ -177,6 +179,7 @@ def open_services(settings: Settings) -> Services:
             seconds=settings.max_seconds,
             waiting=settings.conversion_queue,
             warm=WARM,
+            allowed=_allowed(settings),
         )
         return _services(settings, store, pool, intake)
     except BaseException:
@@ -184,6 +187,15 @@ def open_services(settings: Settings) -> Services:
             pool.close()
         store.close()
         raise
+
+
+def _allowed(settings: Settings) -> Allowed:
+    """What worker processes may do: read the database, and nothing else that anybody would notice."""
+    if settings.database.startswith("sqlite"):
+        file = make_url(settings.database).database
+        # Readers of a write-ahead log share memory through a file beside the database.
+        return Allowed(overwrite=(Path(file).resolve().parent,) if file else ())
+    return Allowed(ports=(make_url(settings.database).port or 5432,))
 
 
 def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> Services:
