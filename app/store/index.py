@@ -9,12 +9,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, Row, and_, delete, func, insert, or_, select, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    LargeBinary,
+    Row,
+    and_,
+    delete,
+    func,
+    insert,
+    literal,
+    or_,
+    select,
+    update,
+)
 
 from app.model.layers import VECTOR_LAYERS, Layer, PartKey
 from app.store import difference, tables
 from app.store.base import Base
 from app.store.changes import IndexRows
+from app.store.extent import geometry as to_geometry
 from app.store.manifest import read_version
 from app.store.parts import split_box
 from app.store.prepare import differing_keys, index_rows, roots_of
@@ -61,11 +75,12 @@ def apply(connection: Connection, environment_id: str, rows: Sequence[IndexRows]
 def meets(table: Any, geometry: ColumnElement[Any], box: Box, dialect: str) -> ColumnElement[bool]:
     """A condition: the row's box, or on PostgreSQL its geometry's, meets a box in degrees."""
     conditions: list[ColumnElement[bool]] = []
-    for west, south, east, north in split_box(box):
+    for part in split_box(box):
         if dialect == "postgresql":
-            envelope = func.ST_MakeEnvelope(west, south, east, north, 4326)
-            conditions.append(func.ST_Intersects(geometry, envelope))
+            shape = tables.from_wkb(literal(to_geometry(part), LargeBinary))
+            conditions.append(func.ST_Intersects(geometry, shape))
             continue
+        west, south, east, north = part
         across = table.c.west > table.c.east
         inside = and_(table.c.west <= east, table.c.east >= west)
         wrapped = and_(across, or_(table.c.west <= east, table.c.east >= west))

@@ -1,0 +1,290 @@
+"""What bad luck must not achieve: a killed process, damaged bytes, a full disk, a database that does not answer."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+
+from app.errors import Damaged, Invalid, NotFound, Unavailable
+from app.model.features import Features
+from app.model.layers import VECTOR_LAYERS, Layers
+from app.store import Store
+from app.store.changes import Changes, Replace
+from app.store.encode import compress, digest
+from app.store.values import Source, Version
+from tests.store.samples import (
+    DATUM,
+    GRID,
+    TOPOLOGY,
+    assert_same_layers,
+    everything,
+    grid,
+    network,
+    replaces,
+    save,
+)
+
+CHILD = """
+import sys
+from pathlib import Path
+from app.model.layers import PartKey
+from app.store import Store
+from app.store.changes import Changes, Replace
+from app.store.values import Source
+from tests.store.samples import TOPOLOGY, GRID, network, grid
+
+store = Store(sys.argv[1], Path(sys.argv[2]))
+print("ready", flush=True)
+for n in range(1000):
+    head = store.version("farm")
+    data = b"upload %d" % head.number + bytes(100_000)
+    files = store.blobs.put_many([data, b"small %d" % n, b"other %d" % n])
+    operations = (Replace(TOPOLOGY, network(400, seed=head.number)), Replace(GRID, grid(seed=head.number)))
+    prepared = store.prepare(head, Changes(operations))
+    sources = [Source(f"f{k}", 1, sha) for k, sha in enumerate(files)]
+    made = store.commit("farm", prepared, author="child", message=str(head.number), sources=sources)
+    print("committed", made.number, made.root, flush=True)
+"""
+
+
+def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
+    store.create_environment("farm", datum=DATUM)
+    random.seed(1)
+    acknowledged: dict[int, str] = {}
+    root = Path(__file__).resolve().parents[2]
+    for _ in range(4):
+        child = subprocess.Popen(
+            [sys.executable, "-c", CHILD, store.database_url, str(store.blob_dir)],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=root,
+            env={**os.environ, "PYTHONPATH": str(root)},
+        )
+        assert child.stdout is not None
+        assert child.stdout.readline() == "ready\n"
+        time.sleep(random.uniform(0.05, 0.6))
+        child.send_signal(signal.SIGKILL)
+        for line in child.stdout:
+            if line.startswith("committed") and line.endswith("\n"):
+                _, number, known = line.split()
+                acknowledged[int(number)] = known
+        child.stdout.close()
+        child.wait()
+        again = Store(store.database_url, store.blob_dir)
+        again.recover()
+        again.check()
+        head = again.version("farm")
+        listed = again.versions("farm", limit=1000)
+        assert [v.number for v in listed] == list(range(head.number, -1, -1))
+        for number, known in acknowledged.items():
+            assert again.version("farm", number).root == known
+        assert [e.sequence for e in again.events("farm", limit=10_000)] == list(range(1, head.number + 2))
+        for version in listed[:2]:
+            loaded = again.load(version)
+            if version.parts:
+                expected = {TOPOLOGY: network(400, seed=version.number - 1), GRID: grid(seed=version.number - 1)}
+                assert_same_layers(loaded, Layers(expected, DATUM))
+            for source in version.sources:
+                assert again.blobs.get(source.sha256)
+        if again.database_url.startswith("sqlite"):
+            with again._database.read() as connection:
+                assert connection.exec_driver_sql("PRAGMA integrity_check").scalar_one() == "ok"
+        again.close()
+    assert acknowledged
+    save(store, "farm", Replace(TOPOLOGY, network(3)))
+    store.collect(timedelta(0))
+    assert not list((store.blob_dir / "tmp").iterdir())
+    assert store.blobs.verify() == []
+
+
+def read_all(store: Store, version: Version) -> None:
+    """Read every chunk of a version; loading alone leaves out the tables of ids."""
+    store.load(version)
+    for entry in version.parts:
+        if entry.key.layer in VECTOR_LAYERS:
+            part = everything()[entry.key]
+            assert isinstance(part, Features)
+            store.has_ids(version, entry.key, part.ids)
+
+
+def test_a_damaged_chunk_is_an_alarm_and_no_answer(store: Store):
+    store.create_environment("farm", datum=DATUM)
+    made = save(store, "farm", *replaces(everything()))
+    with store._database.read() as connection:
+        chunks = connection.exec_driver_sql("SELECT hash, data FROM chunk").all()
+    mark = "?" if store.database_url.startswith("sqlite") else "%s"
+    random.seed(2)
+    for name, data in random.sample(chunks, 6):
+        flipped = bytearray(bytes(data))
+        flipped[len(flipped) // 2] ^= 1
+        for wrong in (bytes(flipped), compress(b"something else"), b"", None):
+            with store._database.write() as connection:
+                if wrong is None:
+                    connection.exec_driver_sql(f"DELETE FROM chunk WHERE hash = {mark}", (name,))
+                else:
+                    connection.exec_driver_sql(f"UPDATE chunk SET data = {mark} WHERE hash = {mark}", (wrong, name))
+            store._chunks.forget()
+            with pytest.raises(Damaged):
+                read_all(store, made)
+        with store._database.write() as connection:
+            if store.database_url.startswith("sqlite"):
+                statement = "INSERT OR REPLACE INTO chunk (hash, data, used) VALUES (?, ?, 0)"
+            else:
+                statement = "INSERT INTO chunk (hash, data, used) VALUES (%s, %s, 0)"
+            connection.exec_driver_sql(statement, (name, data))
+        store._chunks.forget()
+        assert_same_layers(store.load(made), Layers(everything(), DATUM))
+
+
+def test_collecting_stops_at_damage(sqlite_store: Store):
+    sqlite_store.create_environment("farm")
+    made = save(sqlite_store, "farm", Replace(GRID, grid()))
+    root = bytes.fromhex(made.parts[0].hash)
+    with sqlite_store._database.write() as connection:
+        connection.exec_driver_sql("DELETE FROM chunk WHERE hash = ?", (root,))
+        before = connection.exec_driver_sql("SELECT count(*) FROM chunk").scalar_one()
+    with pytest.raises(Damaged):
+        sqlite_store.collect(timedelta(0))
+    with sqlite_store._database.read() as connection:
+        assert connection.exec_driver_sql("SELECT count(*) FROM chunk").scalar_one() == before
+
+
+def test_damaged_and_lost_blobs_are_alarms(store: Store):
+    big, small, other = b"b" * 100_000, b"small", b"other"
+    names = store.blobs.put_many([big, small, other])
+    assert [hashlib.sha256(d).hexdigest() for d in (big, small, other)] == names
+    path = store.blobs.path(names[0])
+    assert path is not None
+    assert store.blobs.path(names[1]) is None
+    (pack,) = (store.blob_dir / "packs").iterdir()
+    assert pack.read_bytes() == small + other
+    assert store.blobs.verify() == []
+    path.write_bytes(b"c" + big[1:])
+    pack.write_bytes(b"S" + pack.read_bytes()[1:])
+    for name in names[:2]:
+        with pytest.raises(Damaged, match="backup"):
+            store.blobs.get(name)
+        with pytest.raises(Damaged, match="backup"):
+            store.blobs.open(name)
+    assert store.blobs.get(names[2]) == other
+    assert store.blobs.verify() == sorted(names[:2])
+    path.unlink()
+    pack.unlink()
+    for name in names:
+        with pytest.raises(Damaged, match="lost"):
+            store.blobs.get(name)
+    store.blobs.put_many([big, small, other])
+    assert store.blobs.get_many(names) == dict(zip(names, (big, small, other), strict=True))
+    with pytest.raises(NotFound):
+        store.blobs.get("0" * 64)
+
+
+def test_blobs_come_from_bytes_and_files_and_are_written_once(store: Store, tmp_path: Path):
+    spooled = tmp_path / "upload"
+    spooled.write_bytes(b"x" * 3_000_000)
+    (tmp_path / "tiny").write_bytes(b"t")
+    names = store.blobs.put_many([spooled, tmp_path / "tiny", b"t", b"", spooled])
+    assert names[0] == names[4]
+    assert names[1] == names[2]
+    assert store.blobs.size(names[0]) == 3_000_000
+    assert store.blobs.get(names[3]) == b""
+    with store.blobs.open(names[0]) as file:
+        file.seek(2_999_999)
+        assert file.read() == b"x"
+    with store.blobs.open(names[1]) as file:
+        assert file.read() == b"t"
+    before = sorted((p, p.stat().st_mtime_ns) for p in store.blob_dir.rglob("*") if p.is_file())
+    assert store.blobs.put_many([spooled, b"t"]) == [names[0], names[1]]
+    assert store.blobs.put(spooled) == names[0]
+    after = sorted((p, p.stat().st_mtime_ns) for p in store.blob_dir.rglob("*") if p.is_file())
+    assert [b for b in before if b[0].name != ".generation"] == [a for a in after if a[0].name != ".generation"]
+    assert not list((store.blob_dir / "tmp").iterdir())
+
+
+def test_what_a_killed_upload_left_is_removed_at_the_start(store: Store):
+    old = time.time() - 3 * 24 * 3600
+    for name in ("tmp/abc", "packs/" + "1" * 64):
+        path = store.blob_dir / name
+        path.write_bytes(b"half")
+        os.utime(path, (old, old))
+    fresh = store.blob_dir / "tmp" / "in-progress"
+    fresh.write_bytes(b"now")
+    (name,) = store.blobs.put_many([b"z" * 70_000])
+    store.recover()
+    assert [p.name for p in (store.blob_dir / "tmp").iterdir()] == ["in-progress"]
+    assert not list((store.blob_dir / "packs").iterdir())
+    assert store.blobs.get(name) == b"z" * 70_000
+
+
+def test_a_disk_that_refuses_is_unavailable_and_leaves_nothing(store: Store, monkeypatch: pytest.MonkeyPatch):
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("app.store.blobs.os.fsync", full)
+    with pytest.raises(Unavailable, match="No space"):
+        store.blobs.put(b"x" * 100_000)
+    with pytest.raises(Unavailable, match="No space"):
+        store.blobs.put_many([b"x", b"y"])
+    monkeypatch.undo()
+    assert not list((store.blob_dir / "tmp").iterdir())
+    with store._database.read() as connection:
+        assert connection.exec_driver_sql("SELECT count(*) FROM blob").scalar_one() == 0
+
+
+def test_a_failing_commit_stores_nothing(store: Store, monkeypatch: pytest.MonkeyPatch):
+    store.create_environment("farm", datum=DATUM)
+    head = store.version("farm")
+    prepared = store.prepare(head, Changes((Replace(GRID, grid()),)))
+    events = store.events("farm")
+
+    def fail(*args: object, **more: object) -> None:
+        raise RuntimeError("after everything but the event")
+
+    monkeypatch.setattr("app.store.outbox.append", fail)
+    with pytest.raises(RuntimeError):
+        store.commit("farm", prepared, author="a", message="m")
+    monkeypatch.undo()
+    assert store.version("farm") == head
+    assert store.events("farm") == events
+    with store._database.read() as connection:
+        assert connection.exec_driver_sql("SELECT count(*) FROM chunk").scalar_one() == 0
+    with pytest.raises(Unavailable):
+        store.commit("farm", prepared, author="a", message="m", sources=[Source("x", 1, "f" * 64)])
+    assert store.version("farm") == head
+
+
+def test_a_locked_sqlite_is_unavailable_not_a_crash(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch):
+    import app.store.database as database
+
+    monkeypatch.setattr(database, "BUSY_MILLISECONDS", 50)
+    other = Store(sqlite_store.database_url, sqlite_store.blob_dir)
+    with sqlite_store._database.write(), pytest.raises(Unavailable, match="locked"):
+        other.create_environment("farm")
+    other.create_environment("farm")
+    other.close()
+
+
+def test_other_urls_are_refused(tmp_path: Path):
+    for url in ("mysql://x/y", "nonsense"):
+        with pytest.raises(Invalid, match="postgresql"):
+            Store(url, tmp_path)
+
+
+def test_chunks_are_named_by_their_canonical_bytes(store: Store):
+    store.create_environment("farm")
+    save(store, "farm", *replaces(everything()))
+    from app.store.encode import decompress
+
+    with store._database.read() as connection:
+        rows = connection.exec_driver_sql("SELECT hash, data FROM chunk").all()
+    assert len(rows) > 20
+    assert all(digest(decompress(bytes(data))) == bytes(name) for name, data in rows)

@@ -1,0 +1,624 @@
+"""The conformance suite of versions and content; every test runs on both databases."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from app.errors import Conflict, Invalid, NotFound, Problem, StaleParent, Unavailable
+from app.model.features import Features, features
+from app.model.frame import Datum, Level
+from app.model.layers import Layers, Part, PartKey, Resources
+from app.store import Store
+from app.store.changes import Changes, Delete, Drop, Put, Replace
+from app.store.values import Idempotency, Provenance, Source
+from tests.store.samples import (
+    DATUM,
+    GRID,
+    OBJECTS,
+    TOPOLOGY,
+    assert_same_layers,
+    assert_same_part,
+    everything,
+    grid,
+    mixed,
+    network,
+    picture,
+    replaces,
+    rows,
+    save,
+    voxels,
+)
+
+
+@pytest.fixture
+def farm(store: Store) -> Store:
+    store.create_environment("farm", datum=DATUM)
+    return store
+
+
+def test_every_kind_of_part_comes_back_whole(farm: Store):
+    parts = everything()
+    made = save(farm, "farm", *replaces(parts))
+    assert made.number == 2
+    assert made.parent == 1
+    assert [e.key for e in made.parts] == sorted(parts)
+    assert_same_layers(farm.load(farm.version("farm")), Layers(parts, DATUM))
+    some = farm.load(made, [GRID, OBJECTS])
+    assert set(some.parts) == {GRID, OBJECTS}
+    with pytest.raises(NotFound, match="occupancy"):
+        farm.load(made, [PartKey("occupancy", "ground", "keepout")])
+
+
+def test_another_process_reads_the_same(farm: Store, tmp_path: Path):
+    parts = everything()
+    made = save(farm, "farm", *replaces(parts))
+    other = Store(farm.database_url, farm.blob_dir, readonly=True)
+    assert_same_layers(other.load(other.version("farm")), Layers(parts, DATUM))
+    assert other.prepare(made, Changes((Drop(GRID),))).changed
+    with pytest.raises((Unavailable, Invalid)):
+        other.create_environment("second")
+    other.close()
+
+
+def test_equal_content_has_equal_roots_on_both_databases(store: Store, sqlite_store: Store):
+    for one in (store, sqlite_store):
+        one.create_environment("farm", datum=DATUM)
+        save(one, "farm", *replaces(everything()))
+    assert store.version("farm").root == sqlite_store.version("farm").root
+
+
+def test_the_root_depends_on_content_alone(farm: Store):
+    farm.create_environment("other", title="t")
+    save(farm, "other", *replaces(everything()))
+    there = save(farm, "other", datum=DATUM)
+    here = farm.prepare(
+        farm.version("farm"), Changes(tuple(Replace(k, p, Provenance("derived")) for k, p in everything().items()))
+    )
+    assert here.root == there.root
+    for changed in (
+        Changes((Drop(GRID),)),
+        Changes(datum=Datum(53.2, -0.5)),
+        Changes(datum=None),
+        Changes(levels=(Level(), Level("first", 3.0))),
+    ):
+        assert farm.prepare(there, changed).root != there.root
+
+
+def test_the_same_again_changes_nothing(farm: Store):
+    first = save(farm, "farm", *replaces(everything()))
+    farm._chunks.forget()
+    reads = farm._chunks.reads
+    prepared = farm.prepare(first, Changes((Replace(TOPOLOGY, network(300)),)))
+    assert not prepared.changed
+    assert not prepared.chunks
+    assert farm._chunks.reads - reads == 1  # the part's root alone
+    shuffled = network(300).take(np.random.default_rng(0).permutation(300))
+    assert not farm.prepare(first, Changes((Replace(TOPOLOGY, shuffled),))).changed
+    assert not farm.prepare(first, Changes(replaces(everything()))).changed
+    digest = farm.blobs.put(b"again")
+    same = farm.commit("farm", prepared, author="bob", message="x", sources=[Source("again.txt", 5, digest)])
+    assert same.number == first.number
+    assert [(s.name, s.used) for s in same.sources] == [("again.txt", False)]
+    assert farm.version("farm").number == first.number
+    assert farm.add_sources("farm", first.number, [Source("again.txt", 5, digest)]).sources == same.sources
+
+
+def edits(seed: int) -> Callable[[Store], None]:
+    """Rounds of random puts and deletes; after each one the root must be that of a layer uploaded anew."""
+
+    def run(store: Store) -> None:
+        random.seed(seed)
+        rng = np.random.default_rng(seed)
+        known: dict[str, tuple[Any, dict[str, Any], bool]] = {}
+        store.create_environment("a")
+        store.create_environment("b")
+        for round_ in range(14):
+            for local in (True, False):
+                chosen = [f"n{i}" for i in rng.integers(0, 600, rng.choice([0, 1, 5, 200]))]
+                put = {}
+                for i in dict.fromkeys(chosen):
+                    if i in known and known[i][2] != local and rng.random() < 0.5:
+                        continue
+                    stays = i in known and known[i][2] == local and rng.random() < 0.5
+                    place = known[i][0] if stays else shapely.Point(*(rng.random(2) * (300 if local else 0.01)))
+                    put[i] = (place, {"r": round_, "x": [1, 1.0]}, local)
+                operations: list[Any] = []
+                if put:
+                    listed = features([(i, g, p) for i, (g, p, _) in put.items()], "local" if local else "wgs84")
+                    operations.append(Put(TOPOLOGY, listed))
+                    known.update(put)
+                gone = random.sample(sorted(known), min(len(known), int(rng.choice([0, 1, 40])))) if known else []
+                if round_ == 9 and not local:
+                    gone = sorted(known)
+                if gone:
+                    operations.append(Delete(TOPOLOGY, tuple(gone)))
+                    for i in gone:
+                        del known[i]
+                if not operations:
+                    continue
+                head = save(store, "a", *operations)
+                from app.model.features import concatenate
+
+                anew = concatenate(
+                    [
+                        features([(i, g, p) for i, (g, p, here) in known.items() if here is flag], anchor)
+                        for flag, anchor in ((True, "local"), (False, "wgs84"))
+                    ]
+                )
+                fresh = save(store, "b", Replace(TOPOLOGY, anew))
+                assert head.root == fresh.root
+                entry = head.part(TOPOLOGY)
+                assert entry is not None
+                assert entry.count == len(known)
+                assert entry.bounds == fresh.part(TOPOLOGY).bounds  # type: ignore[union-attr]
+        loaded = store.load(store.version("a")).parts[TOPOLOGY]
+        assert isinstance(loaded, Features)
+        assert set(loaded.ids) == set(known)
+
+    return run
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_edits_lead_to_the_root_of_a_new_upload(sqlite_store: Store, seed: int):
+    edits(seed)(sqlite_store)
+
+
+def test_edits_lead_to_the_root_of_a_new_upload_on_each_database(store: Store):
+    edits(99)(store)
+
+
+def test_put_and_delete_say_what_they_changed(farm: Store):
+    save(farm, "farm", Replace(TOPOLOGY, network(200)))
+    new = features(
+        [("n1", shapely.Point(1, 1), {"kind": "node"}), ("new", shapely.Point(2, 2), {"v": 1})],
+        "local",
+        {"tmap2": {"name": "changed"}, "more": 1},
+    )
+    made = save(farm, "farm", Put(TOPOLOGY, new), Delete(TOPOLOGY, ("n2", "n3")))
+    assert made.changes == {"topology": {"added": 1, "changed": 1, "deleted": 2, "document": True}}
+    part = farm.load(made).parts[TOPOLOGY]
+    assert isinstance(part, Features)
+    assert part.document == {"tmap2": {"name": "changed"}, "more": 1}
+    assert len(part) == 199
+    with pytest.raises(NotFound, match="'gone'"):
+        farm.prepare(made, Changes((Delete(TOPOLOGY, ("n1", "gone")),)))
+    with pytest.raises(NotFound):
+        farm.prepare(made, Changes((Delete(OBJECTS, ("n1",)),)))
+    with pytest.raises(NotFound):
+        farm.prepare(made, Changes((Drop(OBJECTS),)))
+    with pytest.raises(Invalid):
+        farm.prepare(made, Changes((Put(GRID, new),)))
+    with pytest.raises(Invalid):
+        farm.prepare(made, Changes((Replace(GRID, new),)))
+
+
+def test_an_integer_that_becomes_a_float_is_a_change(farm: Store):
+    save(farm, "farm", Replace(TOPOLOGY, features([("a", shapely.Point(0, 0), {"v": 1, "w": 2})], "local")))
+    before = farm.version("farm")
+    after = save(farm, "farm", Replace(TOPOLOGY, features([("a", shapely.Point(0, 0), {"v": 1.0, "w": 2})], "local")))
+    assert after.changes == {"topology": {"added": 0, "changed": 1, "deleted": 0}}
+    assert farm.diff(before, after) == {
+        "topology": {"added": [], "changed": [{"id": "a", "fields": ["v"]}], "deleted": []}
+    }
+
+
+def test_features_come_by_id_and_by_document_order(farm: Store):
+    made = save(farm, "farm", Replace(TOPOLOGY, network(300)))
+    part = farm.load(made).parts[TOPOLOGY]
+    assert isinstance(part, Features)
+    assert list(part.ids) == sorted(part.ids)
+    assert farm.has_ids(made, TOPOLOGY, ["n5", "n299", "nope"]) == {"n5", "n299"}
+    assert farm.has_ids(made, OBJECTS, ["n5"]) == set()
+    some = farm.get(made, TOPOLOGY, ["n7", "n250", "nope"])
+    assert some.ids == ("n250", "n7")
+    index = part.index()
+    assert rows(some) == rows(part.take([index["n250"], index["n7"]]))
+
+
+def test_an_old_version_reads_like_the_head(farm: Store):
+    first = save(farm, "farm", *replaces(everything()))
+    farm._chunks.forget()
+    before = farm._chunks.reads
+    farm.load(first)
+    cost = farm._chunks.reads - before
+    for k in range(30):
+        save(farm, "farm", Put(TOPOLOGY, features([(f"n{k}", shapely.Point(k, k), {"k": k})], "local")))
+    old = farm.version("farm", first.number)
+    assert old.root == first.root
+    farm._chunks.forget()
+    before = farm._chunks.reads
+    assert_same_layers(farm.load(old), Layers(everything(), DATUM))
+    assert farm._chunks.reads - before == cost
+
+
+def test_a_version_costs_what_it_changes(farm: Store):
+    save(farm, "farm", Replace(TOPOLOGY, network(20_000, side=3000)), Replace(GRID, grid(3000, 3000)))
+    head = farm.version("farm")
+    near = farm.features(head, TOPOLOGY, bbox=(1000, 1000, 1300, 1300))
+    assert 100 < len(near) < 400
+    changed = Features(
+        near.ids, near.geometry.copy(), tuple({**p, "name": "x"} for p in near.properties), near.local.copy()
+    )
+    one = farm.prepare(head, Changes((Put(TOPOLOGY, changed.take([0])),)))
+    many = farm.prepare(head, Changes((Put(TOPOLOGY, changed),)))
+    assert len(one.chunks) <= 6
+    assert sum(map(len, one.chunks.values())) < 20_000
+    assert len(many.chunks) < 25  # of about 320 leaves
+    cells = grid(3000, 3000).cells.copy()
+    cells[1000:1010, 1000:1010] = 100
+    blocked = farm.prepare(head, Changes((Replace(GRID, grid_of(cells)),)))
+    assert len(blocked.chunks) <= 4
+    assert sum(map(len, blocked.chunks.values())) < 20_000
+
+
+def grid_of(cells: Any) -> Any:
+    made = grid()
+    return type(made)(
+        cells,
+        made.resolution,
+        made.origin,
+        made.mode,
+        made.occupied_thresh,
+        made.free_thresh,
+        made.negate,
+        made.properties,
+    )
+
+
+def test_a_diff_reads_what_differs(farm: Store):
+    save(farm, "farm", Replace(TOPOLOGY, network(20_000, side=3000)))
+    a = farm.version("farm")
+    moved = features([("n17", shapely.Point(5.0, 5.0), {"kind": "node"}), ("new", None, {})], "local")
+    b = save(farm, "farm", Put(TOPOLOGY, moved), Delete(TOPOLOGY, ("n18",)))
+    farm._chunks.forget()
+    before = farm._chunks.reads
+    changed = {"id": "n17", "fields": ["count", "geometry", "name", "weight"]}
+    assert farm.diff(a, b) == {"topology": {"added": ["new"], "changed": [changed], "deleted": ["n18"]}}
+    assert farm._chunks.reads - before < 30
+    assert farm.diff(b, a)["topology"]["added"] == ["n18"]
+    assert farm.diff(a, a) == {}
+
+
+def test_a_box_is_found_at_any_version_without_reading_all(farm: Store):
+    whole = network(20_000, side=3000)
+    old = save(farm, "farm", Replace(TOPOLOGY, whole))
+    save(farm, "farm", Drop(TOPOLOGY))
+    box = (500.0, 700.0, 800.0, 900.0)
+    farm._chunks.forget()
+    before = farm._chunks.reads
+    found = farm.features(old, TOPOLOGY, bbox=box)
+    assert farm._chunks.reads - before < 60
+    xy = shapely.get_coordinates(whole.geometry)
+    inside = (xy[:, 0] >= 500) & (xy[:, 0] <= 800) & (xy[:, 1] >= 700) & (xy[:, 1] <= 900)
+    assert set(found.ids) == {whole.ids[k] for k in np.flatnonzero(inside)}
+    assert found.document == whole.document
+    frame = farm.load(old).frame
+    assert frame is not None
+    corners = frame.to_wgs84(np.array([[500.0, 700.0], [800.0, 900.0]]))
+    (west, south), (east, north) = corners.tolist()
+    degrees = frame.to_wgs84(xy)
+    inside = (degrees[:, 0] >= west) & (degrees[:, 0] <= east) & (degrees[:, 1] >= south) & (degrees[:, 1] <= north)
+    found = farm.features(old, TOPOLOGY, bbox=(west, south, east, north), crs="wgs84")
+    assert set(found.ids) == {whole.ids[k] for k in np.flatnonzero(inside)}
+    some = farm.features(old, TOPOLOGY, bbox=(west, south, east, north), crs="wgs84", ids=found.ids[:3])
+    assert some.ids == found.ids[:3]
+
+
+def test_items_on_earth_and_local_ones_are_found_by_either_kind_of_box(farm: Store):
+    made = save(farm, "farm", Replace(OBJECTS, mixed()))
+    assert set(farm.features(made, OBJECTS, bbox=(-100, -100, 100, 100)).ids) == set("pzlaem")
+    assert set(farm.features(made, OBJECTS, bbox=(-100, -100, 100, -1)).ids) == {"p", "m"}
+    assert set(farm.features(made, OBJECTS, bbox=(5, -100, 100, -0.5)).ids) == set()
+    assert set(farm.features(made, OBJECTS, bbox=(-0.512, 53.19, -0.49, 53.22), crs="wgs84").ids) == set("pzlaem")
+    blind = save(farm, "farm", datum=None)
+    from app.errors import MissingDatum
+
+    with pytest.raises(MissingDatum, match="datum"):
+        farm.features(blind, OBJECTS, bbox=(-1, 53, 0, 54), crs="wgs84")
+
+
+def test_cells_that_change_are_counted_and_boxed(farm: Store):
+    cells = np.zeros((600, 700), np.uint8)
+    save(farm, "farm", Replace(GRID, grid_of(cells)))
+    a = farm.version("farm")
+    assert a.changes["occupancy"]["map"]["freed"] == 600 * 700
+    new = cells.copy()
+    new[10:12, 20:23] = 100
+    new[300, 600] = 255
+    new[301, 600] = 40
+    b = save(farm, "farm", Replace(GRID, grid_of(new)))
+    expected = {
+        "freed": 0,
+        "blocked": 6,
+        "unknown": 1,
+        "other": 1,
+        "bbox": [-3 + 20 * 0.05, 2.5, -3 + 601 * 0.05, 17.1],
+    }
+    assert b.changes["occupancy"]["map"] == {**expected, "bbox": pytest.approx(expected["bbox"])}
+    assert farm.diff(b, a)["occupancy"]["map"]["freed"] == 8
+    delta = farm.delta_parts(a, b)
+    patched = cells.copy()
+    for r in delta.grids[0].rectangles:
+        h, w = r.cells.shape
+        patched[r.row : r.row + h, r.column : r.column + w] = r.cells
+    assert (patched == new).all()
+    assert sum(r.cells.size for r in delta.grids[0].rectangles) <= 10
+
+
+def test_a_grid_that_grows_is_laid_over_the_old_one(farm: Store):
+    cells = np.zeros((50, 60), np.uint8)
+    a = save(farm, "farm", Replace(GRID, grid(60, 50)))
+    old = grid(60, 50).cells
+    wider = np.full((70, 80), 255, np.uint8)
+    wider[10:60, 20:80] = old
+    wider[0, 0] = 100
+    g = grid_of(wider)
+    moved = type(g)(wider, g.resolution, (g.origin[0] - 20 * 0.05, g.origin[1] - 10 * 0.05, 0.0), g.mode)
+    b = save(farm, "farm", Replace(GRID, moved))
+    told = farm.diff(a, b)["occupancy"]["map"]
+    assert (told["freed"], told["blocked"], told["unknown"], told["other"]) == (0, 1, 0, 0)
+    assert {"height", "origin", "width"} <= set(told["fields"])
+    assert farm.delta_parts(a, b).grids[0].whole
+    c = save(farm, "farm", Replace(GRID, grid_of(cells)))
+    turned = type(g)(cells, 0.07, (0.0, 0.0, 0.5), "trinary")
+    told = farm.diff(c, save(farm, "farm", Replace(GRID, turned)))["occupancy"]["map"]
+    assert told["fields"] == ["mode", "origin", "properties", "resolution"]
+    gone = save(farm, "farm", Drop(GRID))
+    assert gone.changes["occupancy"]["map"]["unknown"] == 3000
+    assert farm.delta_parts(c, gone).grids[0].deleted
+
+
+def test_other_layers_tell_counts(farm: Store):
+    key, photo, files = (
+        PartKey("voxels", "ground", "v"),
+        PartKey("imagery", "ground", "i"),
+        PartKey("resources", "ground", "r"),
+    )
+    first: dict[PartKey, Part] = {key: voxels(100), photo: picture(), files: Resources({"a": b"1", "b": b"2"})}
+    a = save(farm, "farm", *replaces(first))
+    pixels = picture().pixels.copy()
+    pixels[0, 0, 0] += 1
+    p = picture()
+    second: dict[PartKey, Part] = {
+        key: voxels(100),
+        photo: type(p)(pixels, p.transform, p.crs, {}),
+        files: Resources({"a": b"1", "b": b"3", "c": b"4"}),
+    }
+    b = save(farm, "farm", *replaces(second))
+    assert farm.diff(a, b) == {
+        "imagery": {"i": {"added": 0, "changed": 1, "deleted": 0, "fields": ["properties"]}},
+        "resources": {"r": {"added": 1, "changed": 1, "deleted": 0}},
+    }
+    assert b.changes == farm.diff(a, b)
+    assert farm.delta_parts(a, b).other == (photo, files)
+    for dtype in (np.uint16, np.float32, bool):
+        again = save(farm, "farm", Replace(photo, picture(dtype=dtype)))
+        assert_same_part(farm.load(again, [photo]).parts[photo], picture(dtype=dtype))
+
+
+def test_a_delta_turns_one_version_into_the_other(farm: Store):
+    a = save(farm, "farm", Replace(TOPOLOGY, network(500)))
+    put = features([("n3", shapely.Point(9, 9), {"v": 2}), ("x", None, {})], "local")
+    b = save(farm, "farm", Put(TOPOLOGY, put), Delete(TOPOLOGY, ("n4",)), datum=Datum(1, 2))
+    delta = farm.delta_parts(a, b)
+    assert delta.datum
+    assert not delta.levels
+    (one,) = delta.features
+    assert rows(one.put) == rows(put)
+    assert one.deleted == ("n4",)
+
+
+def test_only_one_of_two_changes_of_the_same_head_wins(farm: Store):
+    head = farm.version("farm")
+    first = farm.prepare(head, Changes((Replace(TOPOLOGY, network(10)),)))
+    second = farm.prepare(head, Changes((Replace(TOPOLOGY, network(11)),)))
+    farm.commit("farm", first, author="a", message="1")
+    with pytest.raises(StaleParent, match="version 2"):
+        farm.commit("farm", second, author="b", message="2")
+    assert farm.version("farm").part(TOPOLOGY).count == 10  # type: ignore[union-attr]
+
+
+def test_many_writers_make_one_line_of_versions(farm: Store):
+    def write(k: int) -> int:
+        store = Store(farm.database_url, farm.blob_dir)
+        try:
+            for n in range(4):
+                for _ in range(200):
+                    put = features([(f"w{k}-{n}", shapely.Point(k, n), {"k": k})], "local")
+                    prepared = store.prepare(store.version("farm"), Changes((Put(TOPOLOGY, put),)))
+                    try:
+                        store.commit("farm", prepared, author=f"w{k}", message=str(n))
+                        break
+                    except StaleParent:
+                        continue
+                else:
+                    raise AssertionError("never came through")
+        finally:
+            store.close()
+        return k
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write, range(4)))
+    listed = farm.versions("farm", limit=100)
+    assert [v.number for v in listed] == list(range(17, -1, -1))
+    assert [v.parent for v in listed] == [*range(16, -1, -1), None]
+    assert farm.version("farm").part(TOPOLOGY).count == 16  # type: ignore[union-attr]
+    assert [e.sequence for e in farm.events("farm")] == list(range(1, 19))
+
+
+def test_threads_may_share_a_store(farm: Store):
+    made = save(farm, "farm", *replaces(everything()))
+    expected = Layers(everything(), DATUM)
+
+    def read(k: int) -> None:
+        farm._chunks.forget()
+        assert_same_layers(farm.load(made), expected)
+        assert farm.prepare(made, Changes((Replace(TOPOLOGY, network(50 + k)),))).changed
+
+    with ThreadPoolExecutor(6) as pool:
+        list(pool.map(read, range(12)))
+
+
+def test_a_key_makes_one_version_however_often_it_is_sent(farm: Store):
+    head = farm.version("farm")
+    prepared = farm.prepare(head, Changes((Replace(TOPOLOGY, network(10)),)))
+    key = Idempotency("abc", "print")
+    made = farm.commit("farm", prepared, author="a", message="m", idempotency=key)
+    assert farm.idempotent("farm", "abc") == ("print", made.number)
+    assert farm.idempotent("farm", "other") is None
+    assert farm.commit("farm", prepared, author="a", message="m", idempotency=key) == made
+    with pytest.raises(Conflict, match="abc"):
+        farm.commit("farm", prepared, author="a", message="m", idempotency=Idempotency("abc", "else"))
+    assert farm.version("farm").number == made.number
+
+
+def test_revert_copies_a_manifest(farm: Store):
+    a = save(farm, "farm", *replaces(everything()))
+    b = save(farm, "farm", Drop(GRID), Put(TOPOLOGY, features([("n1", None, {})], "local")), datum=None)
+    c = farm.revert("farm", a.number, author="bob", message="back")
+    assert (c.number, c.root, c.parent) == (b.number + 1, a.root, b.number)
+    assert c.changes["topology"] == {"added": 0, "changed": 1, "deleted": 0}
+    assert c.changes["occupancy"]["map"]["freed"] > 0
+    assert c.changes["datum"]["to"] == DATUM.as_dict()
+    assert_same_layers(farm.load(c), farm.load(a))
+    assert farm.revert("farm", a.number, author="bob", message="again").number == c.number
+    with pytest.raises(StaleParent):
+        farm.revert("farm", b.number, author="bob", message="x", expected=b.number)
+    key = Idempotency("k", "f")
+    d = farm.revert("farm", b.number, author="bob", message="x", expected=c.number, idempotency=key)
+    assert farm.revert("farm", b.number, author="bob", message="x", expected=c.number, idempotency=key) == d
+    with pytest.raises(NotFound, match="no version 77"):
+        farm.revert("farm", 77, author="bob", message="x")
+
+
+def test_a_version_says_where_it_comes_from(farm: Store):
+    digest = farm.blobs.put(b"content")
+    prepared = farm.prepare(
+        farm.version("farm"),
+        Changes(
+            (
+                Replace(TOPOLOGY, network(5), Provenance("raw", "tmap2", ("a.yaml",), "f" * 64, (), ("ODbL",))),
+                Replace(GRID, grid(), Provenance("derived", steps=({"step": "x", "parameters": {"r": 1.5}},))),
+            )
+        ),
+    )
+    warnings = [Problem("odd\x00 name \ud800", "a.yaml", 3, "nodes[1]")]
+    sources = [Source("a.yaml", 7, digest, "tmap2"), Source("b.txt", 7, digest, None, used=False)]
+    made = farm.commit("farm", prepared, author="ann", message="first", sources=sources, warnings=warnings)
+    again = farm.version("farm", made.number)
+    assert again == made
+    assert again.sources == tuple(sources)
+    assert again.warnings == (Problem("odd\ufffd name ?", "a.yaml", 3, "nodes[1]"),)
+    assert again.information == {
+        "location": "raw",
+        "objects": "missing",
+        "topology": "raw",
+        "occupancy": "derived",
+        "voxels": "missing",
+        "imagery": "missing",
+        "zones": "missing",
+    }
+    body = again.as_dict()
+    assert {"environment", "version", "root", "parent", "author", "message", "time", "changes", "sources"} <= set(body)
+    assert body["warnings"] == [{"file": "a.yaml", "line": 3, "where": "nodes[1]", "problem": "odd\ufffd name ?"}]
+    assert again.part(TOPOLOGY).provenance.attribution == ("ODbL",)  # type: ignore[union-attr]
+    edited = save(farm, "farm", Put(TOPOLOGY, features([("q", None, {})], "local"), Provenance("raw", "edit")))
+    assert edited.part(TOPOLOGY).provenance.sources == ("a.yaml",)  # type: ignore[union-attr]
+    with pytest.raises(Unavailable, match="send it again"):
+        farm.add_sources("farm", made.number, [Source("lost", 1, "0" * 64)])
+    with pytest.raises(Invalid, match="NUL"):
+        farm.commit("farm", prepared, author="ann", message="a\x00b")
+
+
+def test_versions_are_found_by_number_channel_and_latest(farm: Store):
+    for n in range(3):
+        save(farm, "farm", Replace(TOPOLOGY, network(5 + n)))
+    farm.set_channel("farm", "production", 2, author="a")
+    assert farm.version("farm").number == farm.version("farm", "latest").number == farm.version("farm", "4").number == 4
+    assert farm.version("farm", "production").number == 2
+    assert [v.number for v in farm.versions("farm", limit=2)] == [4, 3]
+    assert [v.number for v in farm.versions("farm", limit=2, before=3)] == [2, 1]
+    for ref in ("9", 9, "staging", "no such", ""):
+        with pytest.raises(NotFound):
+            farm.version("farm", ref)
+
+
+def test_a_datum_moves_no_item(farm: Store):
+    a = save(farm, "farm", Replace(OBJECTS, mixed()))
+    b = save(farm, "farm", datum=Datum(10.0, 20.0))
+    assert a.part(OBJECTS) == b.part(OBJECTS)
+    assert b.changes == {"datum": {"from": DATUM.as_dict(), "to": Datum(10.0, 20.0).as_dict()}}
+    assert farm.environment("farm").datum == Datum(10.0, 20.0)
+    with pytest.raises(Invalid, match="same name"):
+        save(farm, "farm", levels=(Level("a"), Level("a", 2.0)))
+
+
+def test_nothing_is_collected_that_a_version_needs(farm: Store):
+    a = save(farm, "farm", *replaces(everything()))
+    digest = farm.blobs.put(b"original")
+    farm.add_sources("farm", a.number, [Source("o", 8, digest)])
+    save(farm, "farm", *(Drop(key) for key in everything()))
+    farm.prepare(a, Changes((Replace(TOPOLOGY, network(7)),)))
+    removed = farm.collect(timedelta(0))
+    assert removed["chunks"] == removed["blobs"] == 0
+    farm._chunks.forget()
+    assert_same_layers(farm.load(farm.version("farm", a.number)), Layers(everything(), DATUM))
+    assert farm.blobs.get(digest) == b"original"
+
+
+def test_what_nothing_needs_is_gone_after_one_collection(farm: Store):
+    save(farm, "farm", *replaces(everything()))
+    farm.create_environment("copy", clone=farm.version("farm"))
+    files = [bytes([k]) * 1000 for k in range(20)]
+    digests = farm.blobs.put_many([*files, b"x" * 200_000])
+    assert farm.collect(timedelta(hours=1)) == {"chunks": 0, "blobs": 0, "bytes": 0, "temporary": 0}
+    farm.add_sources("farm", 2, [Source("keep", 1000, digests[3])])
+    removed = farm.collect(timedelta(0))
+    assert removed["blobs"] == 20
+    assert removed["bytes"] == 19_000 + 200_000
+    assert farm.blobs.get(digests[3]) == files[3]
+    kept = [p for p in farm.blob_dir.rglob("*") if p.is_file() and p.name != ".generation"]
+    total = sum(p.stat().st_size for p in kept)
+    assert total == 1000 + sum(len(v) for v in everything()[PartKey("resources", "ground", "gazebo")].files.values())  # type: ignore[union-attr]
+    with pytest.raises(NotFound):
+        farm.blobs.get(digests[4])
+    farm.delete_environment("farm")
+    farm.purge_environment("farm")
+    assert farm.collect(timedelta(0))["chunks"] == 0
+    assert_same_layers(farm.load(farm.version("copy")), Layers(everything(), DATUM))
+    farm.delete_environment("copy")
+    farm.purge_environment("copy")
+    assert farm.collect(timedelta(0))["chunks"] > 10
+    with farm._database.read() as connection:
+        assert connection.exec_driver_sql("SELECT count(*) FROM chunk").scalar_one() == 0
+    assert not [p for p in farm.blob_dir.rglob("*") if p.is_file() and p.name != ".generation"]
+
+
+def test_a_chunk_that_is_used_again_is_kept(farm: Store):
+    """A commit that finds its chunks there already marks them as used: a collection with a grace period passes."""
+    prepared = farm.prepare(farm.version("farm"), Changes((Replace(TOPOLOGY, network(100)),)))
+    farm.commit("farm", prepared, author="a", message="1")
+    with farm._database.write() as connection:
+        connection.exec_driver_sql("UPDATE chunk SET used = 5")
+        connection.exec_driver_sql("UPDATE blob SET used = 5")
+    farm.create_environment("other", datum=DATUM)
+    farm.commit(
+        "other",
+        farm.prepare(farm.version("other"), Changes((Replace(TOPOLOGY, network(100)),))),
+        author="b",
+        message="2",
+    )
+    farm.delete_environment("farm")
+    farm.purge_environment("farm")
+    farm.delete_environment("other")
+    farm.purge_environment("other")
+    assert farm.collect(timedelta(hours=1))["chunks"] == 0
