@@ -194,10 +194,7 @@ def check(settings: Settings) -> None:
     with _store(settings) as store:
         if settings.database.startswith("sqlite"):
             store.migrate()
-        try:
-            store.check()
-        except Unavailable as error:
-            raise Unavailable(f"{error.detail} (`fleetmap migrate` makes a database's schema current)") from error
+        store.check()
 
 
 def with_demo_token(settings: Settings) -> Settings:

@@ -9,6 +9,7 @@ from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
+from alembic.util import CommandError
 from sqlalchemy import exc
 
 from app.errors import Unavailable
@@ -61,6 +62,11 @@ def upgrade(database: Database) -> None:
                     connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({LOCK})")
                 settings.attributes["connection"] = connection
                 command.upgrade(settings, "head")
+        except CommandError as error:
+            raise Unavailable(
+                "the database was made by a newer release of this server: run that release, or restore a backup of "
+                "the database that is as old as this one"
+            ) from error
         except exc.ProgrammingError as error:
             raise Unavailable(
                 f"the database cannot be migrated: {str(error.orig).splitlines()[0]}. On PostgreSQL PostGIS must be "

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -78,6 +80,38 @@ def test_versions_diff_promote_and_revert(fleetmap: Fleetmap, network: Path, tmp
     assert roots[3] == roots[1] != roots[2]
     assert "hold the same" in fleetmap("diff", "story", "1", "3").out
     assert len(fleetmap("versions", "story", "-n", "2", "--json").json) == 2
+
+
+def test_a_planned_promotion_waits(fleetmap: Fleetmap, network: Path) -> None:
+    history(fleetmap, network, "planned")
+    told = fleetmap("promote", "planned", "2", "--channel", "staging", "--at", "2099-01-31T06:00:00Z", "--json")
+    assert told.status == 0, told.err
+    assert told.json["planned"]["version"] == 2
+    assert "staging" not in fleetmap("versions", "planned").out
+    past = fleetmap("promote", "planned", "2", "--at", "2001-01-31T06:00:00Z")
+    assert past.status == 1
+    assert "past" in past.err
+
+
+def test_a_grid_gets_its_name_and_a_merge_deletes_nothing(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
+    assert fleetmap("import", network, "-e", "merged").status == 0
+    (tmp_path / "mask.yaml").write_text(
+        "image: mask.pgm\nresolution: 0.5\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+    )
+    (tmp_path / "mask.pgm").write_bytes(b"P5 2 2 255\n" + bytes([0, 254, 205, 254]))
+    files = (tmp_path / "mask.yaml", tmp_path / "mask.pgm")
+    told = fleetmap("import", *files, "-e", "merged", "--grid", "keepout", "--mode", "merge")
+    assert told.status == 0, told.err
+    assert fleetmap("export", "merged", "occupancy_grid", "-o", f"{tmp_path}/out/").status == 0
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"keepout.yaml", "keepout.pgm"}
+    only = fleetmap("export", "merged", "occupancy_grid", "--file", "keepout.yaml", "-o", tmp_path / "one.yaml")
+    assert only.status == 0, only.err
+    assert (tmp_path / "one.yaml").read_bytes() == (tmp_path / "out" / "keepout.yaml").read_bytes()
+    network.write_text(network.read_text().replace("name: B", "name: C").replace("node: B", "node: C"))
+    assert fleetmap("import", network, "-e", "merged", "--mode", "merge").status == 0
+    assert fleetmap("export", "merged", "tmap2", "-o", tmp_path / "all.yaml").status == 0
+    text = (tmp_path / "all.yaml").read_text()
+    assert all(f"name: {node}" in text for node in "ABC")
 
 
 def test_a_dry_run_stores_nothing(fleetmap: Fleetmap, network: Path) -> None:
@@ -174,6 +208,8 @@ def test_an_option_that_nobody_knows_is_refused(fleetmap: Fleetmap, network: Pat
 
 
 def test_the_demo_comes_once_and_its_commands_work(fleetmap: Fleetmap, server: str, tmp_path: Path) -> None:
+    if shutil.which("curl") is None:
+        (pytest.fail if os.environ.get("CI") else pytest.skip)("curl is not installed")
     first = fleetmap("demo", "--json").json
     assert first == {"environment": demo.NAME, "version": 1, "created": True}
     assert fleetmap("demo", "--json").json == {**first, "created": False}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import socket
+import sqlite3
 import urllib.request
 from pathlib import Path
 
@@ -135,3 +137,15 @@ def test_migrate_brings_a_database_up_and_hides_its_password(offline: Fleetmap, 
     told = offline("migrate", "--database-url", "postgresql+psycopg://me:hidden-word@127.0.0.1:1/none")
     assert told.status == 1
     assert "hidden-word" not in told.err + told.out
+
+
+def test_a_database_of_a_newer_release_is_left_alone(offline: Fleetmap, tmp_path: Path) -> None:
+    assert offline("migrate", "--data-dir", tmp_path / "data").status == 0
+    with contextlib.closing(sqlite3.connect(tmp_path / "data" / "fleetmap.sqlite3")) as database:
+        database.execute("UPDATE alembic_version SET version_num = 'of-tomorrow'")
+        database.commit()
+    for command in ("serve", "migrate"):
+        told = offline(command, "--data-dir", tmp_path / "data", *(["--port", "0"] if command == "serve" else []))
+        assert told.status == 1
+        assert "newer release" in told.err
+        assert "Traceback" not in told.err

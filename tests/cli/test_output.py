@@ -1,0 +1,70 @@
+"""What people see: places, bars, and nothing that a file could do to their terminal."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from app.cli import output
+from app.cli.history import counts
+
+
+@pytest.mark.parametrize(
+    ("problem", "line"),
+    [
+        ({"file": "a.yaml", "line": 3, "where": "nodes[0]", "problem": "is bad"}, "a.yaml:3: nodes[0]: is bad"),
+        ({"line": 3, "problem": "is bad"}, "line 3: is bad"),
+        ({"file": "a.yaml", "problem": "is bad"}, "a.yaml: is bad"),
+        ({"problem": "is bad"}, "is bad"),
+    ],
+)
+def test_a_problem_names_its_place_as_compilers_do(problem: dict[str, object], line: str) -> None:
+    assert output.place(problem) == line
+
+
+def test_texts_of_files_cannot_steer_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    hostile = "\x1b[2J[red]node[/red]\u202e\r\n"
+    output.show(hostile)
+    output.show_table(["name"], [[hostile]])
+    output.show_problem({"detail": hostile, "errors": [{"file": hostile, "problem": hostile}]})
+    told = capsys.readouterr()
+    for text in (told.out, told.err):
+        assert "[red]node[/red]" in text
+        assert not {"\x1b", "\u202e", "\r"} & set(text)
+
+
+def test_many_problems_are_cut_short(capsys: pytest.CaptureFixture[str]) -> None:
+    output.show_problem({"detail": "bad", "errors": [{"problem": f"p{k}"} for k in range(70)]}, limit=50)
+    told = capsys.readouterr().err
+    assert "p49" in told
+    assert "p50" not in told
+    assert "20 more" in told
+
+
+def test_bars_are_for_terminals_alone(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def work() -> str:
+        capsys.readouterr()
+        with output.progress_bar("uploading", total=10, count_bytes=True) as bar:
+            bar.advance(4)
+            bar.update(completed=10, description="done")
+        return capsys.readouterr().err
+
+    assert work() == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    assert "uploading" in work() or "done" in work()
+
+
+def test_sizes_and_counts_in_words() -> None:
+    assert [output.size(n) for n in (0, 999, 1500, 2_000_000, 3_000_000_000)] == [
+        "0 B",
+        "999 B",
+        "1.5 kB",
+        "2.0 MB",
+        "3.0 GB",
+    ]
+    assert counts({"added": 2, "changed": 0, "document": True}) == "2 added, document"
+    assert counts({"map": {"freed": 3, "bbox": [0, 0, 1, 1]}}) == "map (3 freed)"
+    assert counts({"to": {"latitude": 53.25, "longitude": -0.5}}) == "to (latitude 53.25, longitude -0.5)"
+    assert counts({"added": 0}) == "unchanged"
