@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api import problems
 from app.api.access import environment_of, is_open
+from app.api.answers import API
 from app.api.problems import MalformedBody, SlowBody, UnsupportedMedia
 from app.api.services import Services
 from app.errors import Denied, FleetMapError, TooLarge
@@ -74,7 +75,7 @@ class Guard:
         except Exception as error:  # noqa: BLE001  the last place where a bug can become a 500 with a shape
             await self._refuse(problems.of_bug(error), scope, body, answer)
         finally:
-            route = scope["state"].get("route") or getattr(scope.get("route"), "path", "other")
+            route = scope["state"].get("route") or _template(scope)
             method = scope["method"] if scope["method"] in _METHODS else "other"
             here.metrics.requests.labels(method, route, str(answer.status)).inc()
             here.metrics.seconds.labels(route).observe(time.perf_counter() - started)
@@ -104,6 +105,14 @@ class Guard:
         if not await body.drain():
             response.headers["connection"] = "close"
         await response(scope, body, answer)
+
+
+def _template(scope: Scope) -> str:
+    """The answering route's whole path template: the API's routers tell theirs without its prefix."""
+    path = str(getattr(scope.get("route"), "path", ""))
+    if not path:
+        return "other"
+    return path if path.startswith(API) or not scope["path"].startswith(API) else API + path
 
 
 def _headers(scope: Scope) -> dict[bytes, bytes]:

@@ -71,6 +71,31 @@ def test_the_same_again_is_304(api: Api, farm: str) -> None:
         assert api.get(path, headers={"If-None-Match": '"other"'}).content
 
 
+def test_repeated_requests_are_answered_from_memory(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a second neither database nor disk is asked; then the answer must be confirmed."""
+    from app.errors import Unavailable
+    from app.store import Store
+
+    def away(*_: object) -> None:
+        raise Unavailable("the database is away")
+
+    path = f"/maps/{farm}/tmap2"
+    first = api.get(path)
+    time.sleep(1.1)
+    first = api.get(path)
+    monkeypatch.setattr(Store, "version", away)
+    monkeypatch.setattr(Store, "find_token", away)
+    for _ in range(5):
+        again = api.get(path)
+        assert again.content == first.content
+        assert dict(again.headers).keys() == dict(first.headers).keys()
+        api.get(path, 304, headers={"If-None-Match": first.headers["etag"]})
+    time.sleep(1.1)
+    api.problem("GET", path, 503)
+    monkeypatch.undo()
+    assert api.get(path).content == first.content
+
+
 def test_304_without_making(api: Api, farm: str) -> None:
     """A robot that has the map already costs no conversion, also after a restart of the server."""
     path = f"environments/{farm}/versions/3/maps/kml"

@@ -322,6 +322,7 @@ def test_health_and_metrics(api: Api, farm: str) -> None:
         assert re.search(rf"^{name}[{{ ]", text, re.MULTILINE), name
     assert f'fleetmap_head{{environment="{farm}"}} 3.0' in text
     assert 'route="/maps/{env}/{format}"' in text
+    assert 'route="/api/v1/environments/{env}/versions"' in text
     assert farm not in "".join(line for line in text.splitlines() if line.startswith("fleetmap_requests"))
 
 
