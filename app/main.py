@@ -210,12 +210,8 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         options=ApiOptions(
             limits=settings.limits,
             spool_dir=settings.spool_dir,
-            job_seconds=settings.job_seconds,
             max_json_bytes=settings.max_json_bytes,
-            max_uploads=settings.max_uploads,
             body_seconds=settings.body_seconds,
-            token_failures=settings.token_failures,
-            memory_cache_bytes=settings.memory_cache_bytes,
             insecure_no_auth=settings.insecure_no_auth,
         ),
         store=store,

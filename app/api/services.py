@@ -28,12 +28,8 @@ class ApiOptions:
 
     limits: Limits
     spool_dir: Path
-    job_seconds: float = 20.0
     max_json_bytes: int = 64 * 2**20
-    max_uploads: int = 8
     body_seconds: float = 30.0
-    token_failures: int = 20
-    memory_cache_bytes: int = 128 * 2**20
     insecure_no_auth: bool = False
 
 
