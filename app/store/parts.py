@@ -711,8 +711,12 @@ _gc_was_on = False
 
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Without Python's cycle collector: it would look at every one of the many new objects again and again (a whole
-    layer loads two to three times slower with it), and what is made here has no cycles."""
+    """Without Python's cycle collector, for work that makes very many objects and no cycles.
+
+    It would look at all of them again and again (a whole layer loads two to three times slower with it). At the end
+    they are counted among the old objects, or the next collection of the young ones would take as long as it saved;
+    freezing and unfreezing does that without a look at any of them.
+    """
     global _gc_users, _gc_was_on  # noqa: PLW0603 - one switch for the interpreter
     with _gc_lock:
         if _gc_users == 0:
@@ -725,6 +729,9 @@ def no_garbage_collection() -> Iterator[None]:
         with _gc_lock:
             _gc_users -= 1
             if _gc_users == 0 and _gc_was_on:
+                if gc.get_freeze_count() == 0:
+                    gc.freeze()
+                    gc.unfreeze()
                 gc.enable()
 
 
