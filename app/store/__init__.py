@@ -25,7 +25,7 @@ from app.store.tokens import Tokens
 from app.store.versions import Versions
 
 ABANDONED_SECONDS = 24 * 3600.0
-"""A temporary file of this age belongs to no living upload, whichever process made it."""
+"""A pack of this age that no row knows is no living upload's: the row comes right after it."""
 
 
 class Store(Environments, Versions, Content, SpatialIndex, Channels, Outbox, Tokens, Jobs, Collection):
@@ -59,7 +59,7 @@ class Store(Environments, Versions, Content, SpatialIndex, Channels, Outbox, Tok
         self.blobs.check()
 
     def recover(self) -> None:
-        """At start: remove what a killed upload left behind. Safe beside other processes: only what is a day old."""
+        """At start: remove what a killed upload left behind. Safe beside other processes that are at work."""
         self.blobs.recover(ABANDONED_SECONDS)
 
     def close(self) -> None:

@@ -2,11 +2,14 @@
 
 A blob lies in ``ab/abcdef…`` (its SHA-256), or with many other small ones in ``packs/<SHA-256 of the pack>``; the table
 ``blob`` says which. What is written gets a temporary name, is synced, renamed, and its folder synced, before anything
-refers to it. The table's row comes first when a blob is used again, so that a collection in progress leaves it alone.
+refers to it. Temporary names lie in ``tmp``, in a folder of each upload, which its process locks while it lives: so the
+next start can tell what a killed one left. The table's row comes first when a blob is used again, so that a collection
+in progress leaves it alone.
 """
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import io
 import os
@@ -14,7 +17,8 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -29,6 +33,7 @@ from app.store.tables import blob
 PACKED_BELOW: Final = 64 * 2**10
 """Smaller files of one upload share a pack."""
 
+LOCK: Final = ".lock"
 PACK_BYTES: Final = 64 * 2**20
 BLOCK: Final = 2**20
 BATCH: Final = 500
@@ -65,6 +70,30 @@ class Blobs:
 
     def _path(self, sha256: str) -> Path:
         return self.folder / sha256[:2] / sha256
+
+    @contextmanager
+    def _workspace(self) -> Iterator[Path]:
+        """A folder for temporary names, locked as long as this process works in it."""
+        folder = self._temporary / secrets.token_hex(16)
+        with self._census(shared=True):
+            folder.mkdir()
+            lock = os.open(folder / LOCK, os.O_CREAT | os.O_RDWR, 0o600)
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+            os.close(lock)
+
+    @contextmanager
+    def _census(self, *, shared: bool) -> Iterator[None]:
+        """Keeps the search for abandoned workspaces away from one that is just being made."""
+        lock = os.open(self._temporary / LOCK, os.O_CREAT | os.O_RDWR, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(lock)
 
     # --- writing ---
 
@@ -104,12 +133,11 @@ class Blobs:
             names.append(name)
         known = self._touch(sizes)
         lost = {n for n in sizes if not self._present(n, known.get(n))}
-        self._write_large({n: d for n, d in large.items() if n in lost})
-        rows: list[dict[str, object]] = [
-            {"sha256": n, "size": sizes[n], "pack": None, "start": 0} for n in large if n in lost
-        ]
-        rows += self._write_packs({n: d for n, d in small.items() if n in lost})
-        if rows:
+        if lost:
+            with self._workspace() as workspace:
+                self._write_large(workspace, {n: d for n, d in large.items() if n in lost})
+                rows = self._write_packs(workspace, {n: d for n, d in small.items() if n in lost})
+            rows += [{"sha256": n, "size": sizes[n], "pack": None, "start": 0} for n in large if n in lost]
             with self._database.write() as connection:
                 _upsert(connection, [r for r in rows if r["sha256"] not in known])
                 # A row whose file was lost: the content is back, at a new place.
@@ -142,37 +170,31 @@ class Blobs:
         except OSError:
             return False
 
-    def _write_large(self, files: Mapping[str, bytes | Path]) -> None:
-        written: list[tuple[Path, Path]] = []
+    def _write_large(self, workspace: Path, files: Mapping[str, bytes | Path]) -> None:
         folders: set[Path] = set()
-        try:
-            for name, data in files.items():
-                temporary = self._temporary / secrets.token_hex(16)
-                written.append((temporary, self._path(name)))
-                with temporary.open("wb") as out:
-                    if isinstance(data, bytes):
-                        out.write(data)
-                    else:
-                        with data.open("rb") as source:
-                            shutil.copyfileobj(source, out, BLOCK)
-                    out.flush()
-                    os.fsync(out.fileno())
-                if not isinstance(data, bytes) and _hash_file(temporary) != name:
-                    raise OSError(f"{data.name} changed while it was stored")
-            for temporary, path in written:
-                if not path.parent.is_dir():
-                    path.parent.mkdir(exist_ok=True)
-                    folders.add(self.folder)
-                temporary.replace(path)
-                folders.add(path.parent)
-        except BaseException:
-            for temporary, _ in written:
-                temporary.unlink(missing_ok=True)
-            raise
+        for name, data in files.items():
+            temporary = workspace / name
+            with temporary.open("wb") as out:
+                if isinstance(data, bytes):
+                    out.write(data)
+                else:
+                    with data.open("rb") as source:
+                        shutil.copyfileobj(source, out, BLOCK)
+                out.flush()
+                os.fsync(out.fileno())
+            if not isinstance(data, bytes) and _hash_file(temporary) != name:
+                raise OSError(f"{data.name} changed while it was stored")
+        for name in files:
+            path = self._path(name)
+            if not path.parent.is_dir():
+                path.parent.mkdir(exist_ok=True)
+                folders.add(self.folder)
+            (workspace / name).replace(path)
+            folders.add(path.parent)
         for folder in folders:
             _sync_folder(folder)
 
-    def _write_packs(self, files: Mapping[str, bytes]) -> list[dict[str, object]]:
+    def _write_packs(self, workspace: Path, files: Mapping[str, bytes]) -> list[dict[str, object]]:
         """Packs of at most 64 MiB; the rows that say where each file is in them."""
         rows: list[dict[str, object]] = []
         group: list[str] = []
@@ -181,26 +203,22 @@ class Blobs:
             group.append(name)
             size += len(files[name])
             if size >= PACK_BYTES:
-                rows += self._write_pack({n: files[n] for n in group})
+                rows += self._write_pack(workspace, {n: files[n] for n in group})
                 group, size = [], 0
         if group:
-            rows += self._write_pack({n: files[n] for n in group})
+            rows += self._write_pack(workspace, {n: files[n] for n in group})
         return rows
 
-    def _write_pack(self, files: Mapping[str, bytes]) -> list[dict[str, object]]:
+    def _write_pack(self, workspace: Path, files: Mapping[str, bytes]) -> list[dict[str, object]]:
         whole = b"".join(files.values())
         # Two packs with the same content in another order of names are two files: no row ever changes its meaning.
         pack = hashlib.sha256(whole + secrets.token_bytes(16)).hexdigest()
-        temporary = self._temporary / secrets.token_hex(16)
-        try:
-            with temporary.open("wb") as out:
-                out.write(whole)
-                out.flush()
-                os.fsync(out.fileno())
-            temporary.replace(self._packs / pack)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        temporary = workspace / pack
+        with temporary.open("wb") as out:
+            out.write(whole)
+            out.flush()
+            os.fsync(out.fileno())
+        temporary.replace(self._packs / pack)
         _sync_folder(self._packs)
         rows: list[dict[str, object]] = []
         start = 0
@@ -288,22 +306,25 @@ class Blobs:
     # --- upkeep ---
 
     def check(self) -> None:
-        """Unavailable unless the folder can be written."""
+        """Unavailable unless the folder can be written (where it is to be)."""
         try:
+            if self._readonly:
+                next(self.folder.iterdir(), None)
+                return
             self.prepare()
-            probe = self._temporary / f"probe-{secrets.token_hex(8)}"
-            probe.write_bytes(b"")
-            probe.unlink()
+            with self._workspace() as workspace:
+                (workspace / "probe").write_bytes(b"")
         except OSError as error:
             raise Unavailable(f"the blob folder cannot be written: {error.strerror or error}") from error
 
     def recover(self, older_than: float) -> int:
-        """Remove temporary files of killed uploads, and packs that no row knows, if older (seconds); how many."""
+        """Remove workspaces of processes that are gone, and packs that no row knows if older (seconds); how many."""
         self.prepare()
         limit = time.time() - older_than
         count = 0
-        for path in self._temporary.iterdir():
-            count += _unlink_if_older(path, limit)
+        with self._census(shared=False):
+            for folder in self._temporary.iterdir():
+                count += folder.is_dir() and _remove_abandoned(folder)
         with self._database.read() as connection:
             known = set(connection.execute(select(blob.c.pack).where(blob.c.pack.is_not(None)).distinct()).scalars())
         for path in self._packs.iterdir():
@@ -348,7 +369,8 @@ class Blobs:
         with self._database.read() as connection:
             names = list(connection.execute(select(blob.c.sha256).where(blob.c.pack == pack)).scalars())
         if names:
-            moved = self._write_pack(self.get_many(names))
+            with self._workspace() as workspace:
+                moved = self._write_pack(workspace, self.get_many(names))
             with self._database.write() as connection:
                 _relocate(
                     connection,
@@ -417,6 +439,24 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _remove_abandoned(folder: Path) -> bool:
+    """Remove a workspace unless a living process has it locked."""
+    try:
+        lock = os.open(folder / LOCK, os.O_RDWR)
+    except FileNotFoundError:
+        shutil.rmtree(folder, ignore_errors=True)
+        return True
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+        return True
+    finally:
+        os.close(lock)
 
 
 def _unlink_if_older(path: Path, limit: float) -> int:

@@ -81,6 +81,7 @@ def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
         child.wait()
         again = Store(store.database_url, store.blob_dir)
         again.recover()
+        assert temporary(again) == []
         again.check()
         head = again.version("farm")
         listed = again.versions("farm", limit=1000)
@@ -102,8 +103,19 @@ def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
     assert acknowledged
     save(store, "farm", Replace(TOPOLOGY, network(3)))
     store.collect(timedelta(0))
-    assert not list((store.blob_dir / "tmp").iterdir())
+    assert temporary(store) == []
     assert store.blobs.verify() == []
+
+
+def temporary(store: Store) -> list[Path]:
+    """The workspaces of uploads."""
+    return [p for p in (store.blob_dir / "tmp").iterdir() if p.name != ".lock"]
+
+
+def files_in(store: Store) -> list[tuple[Path, int]]:
+    """All stored files with their times."""
+    found = sorted(p for p in store.blob_dir.rglob("*") if p.is_file() and not p.name.startswith("."))
+    return [(p, p.stat().st_mtime_ns) for p in found]
 
 
 def read_all(store: Store, version: Version) -> None:
@@ -202,25 +214,35 @@ def test_blobs_come_from_bytes_and_files_and_are_written_once(store: Store, tmp_
         assert file.read() == b"x"
     with store.blobs.open(names[1]) as file:
         assert file.read() == b"t"
-    before = sorted((p, p.stat().st_mtime_ns) for p in store.blob_dir.rglob("*") if p.is_file())
+    before = files_in(store)
     assert store.blobs.put_many([spooled, b"t"]) == [names[0], names[1]]
     assert store.blobs.put(spooled) == names[0]
-    after = sorted((p, p.stat().st_mtime_ns) for p in store.blob_dir.rglob("*") if p.is_file())
-    assert [b for b in before if b[0].name != ".generation"] == [a for a in after if a[0].name != ".generation"]
-    assert not list((store.blob_dir / "tmp").iterdir())
+    assert files_in(store) == before
+    assert temporary(store) == []
 
 
 def test_what_a_killed_upload_left_is_removed_at_the_start(store: Store):
     old = time.time() - 3 * 24 * 3600
-    for name in ("tmp/abc", "packs/" + "1" * 64):
-        path = store.blob_dir / name
-        path.write_bytes(b"half")
-        os.utime(path, (old, old))
-    fresh = store.blob_dir / "tmp" / "in-progress"
-    fresh.write_bytes(b"now")
+    stray = store.blob_dir / "packs" / ("1" * 64)
+    stray.write_bytes(b"half")
+    os.utime(stray, (old, old))
     (name,) = store.blobs.put_many([b"z" * 70_000])
-    store.recover()
-    assert [p.name for p in (store.blob_dir / "tmp").iterdir()] == ["in-progress"]
+    stop_here = (
+        "import sys, os; from pathlib import Path; from app.store import Store; import app.store.blobs as b\n"
+        "b.os.fsync = lambda d: os.kill(os.getpid(), 9)\n"
+        "Store(sys.argv[1], Path(sys.argv[2])).blobs.put_many([b'q' * 100_000])"
+    )
+    killed = subprocess.run(
+        [sys.executable, "-c", stop_here, store.database_url, str(store.blob_dir)], check=False, timeout=60
+    )
+    assert killed.returncode == -signal.SIGKILL
+    assert len(temporary(store)) == 1
+    with store.blobs._workspace() as workspace:
+        (workspace / "half").write_bytes(b"in progress")
+        store.recover()
+        assert [workspace] == temporary(store)
+        assert (workspace / "half").exists()
+    assert temporary(store) == []
     assert not list((store.blob_dir / "packs").iterdir())
     assert store.blobs.get(name) == b"z" * 70_000
 
@@ -235,7 +257,7 @@ def test_a_disk_that_refuses_is_unavailable_and_leaves_nothing(store: Store, mon
     with pytest.raises(Unavailable, match="No space"):
         store.blobs.put_many([b"x", b"y"])
     monkeypatch.undo()
-    assert not list((store.blob_dir / "tmp").iterdir())
+    assert temporary(store) == []
     with store._database.read() as connection:
         assert connection.exec_driver_sql("SELECT count(*) FROM blob").scalar_one() == 0
 
