@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from alembic import command
-from alembic.config import Config
-from alembic.runtime.migration import MigrationContext
-from alembic.script import ScriptDirectory
-from alembic.util import CommandError
 from sqlalchemy import exc
 
 from app.errors import Unavailable
 from app.store.database import Database, translated
 from app.store.tables import metadata
+
+if TYPE_CHECKING:
+    from alembic.config import Config
 
 LOCK = 4_820_117_001
 """PostgreSQL's advisory lock: two servers that start together migrate one after the other."""
@@ -30,7 +28,9 @@ def folder() -> Path:
 
 
 def config() -> Config:
-    """Alembic's settings, without a file."""
+    """Alembic's settings, without a file. (It is imported late: worker processes never need it.)"""
+    from alembic.config import Config
+
     made = Config()
     made.set_main_option("script_location", str(folder()).replace("%", "%%"))
     made.set_main_option("path_separator", "os")
@@ -53,6 +53,9 @@ def comparison(dialect: str) -> dict[str, Any]:
 
 def upgrade(database: Database) -> None:
     """To the newest schema."""
+    from alembic import command
+    from alembic.util import CommandError
+
     settings = config()
     with translated(), database.engine.connect() as connection:
         connection.execution_options(write=True)
@@ -76,6 +79,9 @@ def upgrade(database: Database) -> None:
 
 def check(database: Database) -> None:
     """Unavailable unless the schema is the newest."""
+    from alembic.runtime.migration import MigrationContext
+    from alembic.script import ScriptDirectory
+
     newest = ScriptDirectory.from_config(config()).get_current_head()
     with translated(), database.engine.connect() as connection:
         present = MigrationContext.configure(connection).get_current_revision()
