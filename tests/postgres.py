@@ -13,6 +13,7 @@ import subprocess
 import tempfile
 import uuid
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,6 +96,13 @@ def _free_port() -> int:
 @pytest.fixture(scope="session")
 def postgres_cluster() -> Iterator[Cluster]:
     """The cluster; skipped where PostgreSQL or PostGIS is not installed, a failure where CI is set."""
+    with running_cluster() as cluster:
+        yield cluster
+
+
+@contextmanager
+def running_cluster() -> Iterator[Cluster]:
+    """The same, outside of tests."""
     folder = _binaries()
     if folder is None:
         _missing("PostgreSQL is not installed (initdb is not to be found)")
