@@ -17,9 +17,6 @@ from app.store.base import Base, text, utcnow
 from app.store.values import Role, Token
 
 SECRET_BYTES: Final = 32
-SHORTEST: Final = 16
-"""Characters that a token chosen by the operator must have at least."""
-
 
 class Tokens(Base):
     """Who may do what."""
@@ -42,8 +39,8 @@ class Tokens(Base):
             raise Invalid(f"a role must be one of {', '.join(get_args(Role))}, got {role!r}")
         if expires is not None and expires.tzinfo is None:
             raise Invalid("expires needs a time zone, for example 2027-01-01T00:00:00Z")
-        if token is not None and len(token) < SHORTEST:
-            raise Invalid(f"a chosen token must have at least {SHORTEST} characters")
+        if token is not None and not token:
+            raise Invalid("a chosen token must not be empty")
         secret = token or secrets.token_urlsafe(SECRET_BYTES)
         values: dict[str, Any] = {
             "id": secrets.token_hex(8),
