@@ -14,7 +14,7 @@ from app.convert.recipe import Chain
 from app.errors import FleetMapError, Problem
 from app.formats import Format, WriteContext, _archive
 from app.model.features import Features
-from app.model.layers import LAYERS, Layers, PartKey
+from app.model.layers import LAYERS, VECTOR_LAYERS, Layers, PartKey
 from app.store import Store
 from app.store.values import PartEntry, Version
 
@@ -130,7 +130,8 @@ def not_carried(known: Format, entries: Mapping[PartKey, PartEntry] | None, laye
     if entries is not None:
         for key, entry in entries.items():
             if key.layer not in known.carries and entry.count:
-                counts[key.layer] = counts.get(key.layer, 0) + entry.count
+                items = entry.count if key.layer in VECTOR_LAYERS else 1  # grids and pictures, not their cells
+                counts[key.layer] = counts.get(key.layer, 0) + items
     else:
         for key, part in layers.parts.items():
             if key.layer not in known.carries:
