@@ -104,7 +104,7 @@ def as_problem(error: FleetMapError) -> dict[str, Any]:
 
 
 def _serve_without_flags() -> None:
-    """Start the server in the foreground; it stops cleanly on SIGTERM and Ctrl-C."""
+    """Start the server."""
 
 
 def _show_version(wanted: bool) -> None:

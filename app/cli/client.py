@@ -342,8 +342,10 @@ def _check(answer: httpx.Response, token: str | None) -> None:
     hint = ""
     if answer.status_code == httpx.codes.UNAUTHORIZED:
         hint = (
-            "The token is unknown or has expired: give another with --token or FLEETMAP_TOKEN."
+            "Give another with --token or FLEETMAP_TOKEN."
             if token
             else "Give a token with --token or FLEETMAP_TOKEN; the server's first start printed the administrator's."
         )
+    elif answer.status_code == httpx.codes.NOT_FOUND and "no environment" in str(problem.get("detail")):
+        hint = "`fleetmap versions` lists all."
     raise Refused(problem, status=answer.status_code, hint=hint)

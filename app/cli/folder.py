@@ -70,6 +70,20 @@ def environment_name(text: str) -> str:
     return name
 
 
+def check_name(name: str) -> None:
+    """Invalid where a name that the user gave cannot be an environment's, with one that could."""
+    if NAME.fullmatch(name) and name not in RESERVED:
+        return
+    try:
+        proposal = f"; try {environment_name(name)}"
+    except Invalid:
+        proposal = ""
+    raise Invalid(
+        f"{name!r} cannot be an environment's name: 1 to 63 of a-z, 0-9, - and _, starting with a letter or digit, "
+        f"and not robots or server{proposal}"
+    )
+
+
 def single(path: Path, name: str | None = None) -> LocalFile:
     """One file by its own name."""
     return LocalFile(name or path.name, path, path.stat().st_size)

@@ -14,13 +14,19 @@ Environment = Annotated[str, typer.Argument(help="Name of the environment.")]
 
 
 def versions(
-    environment: Environment,
+    environment: Annotated[str | None, typer.Argument(help="Name of the environment [default: list them all].")] = None,
     limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="How many, newest first.")] = 20,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """The history of an environment, newest first, with the channels that stand on each version."""
+    """An environment's history; without a name, all environments.
+
+    The newest version comes first; each is told with the channels that stand on it.
+    """
+    if environment is None:
+        _environments(limit, server, token, as_json=as_json)
+        return
     with Client(server, token) as client:
         page = {"limit": min(limit, 100)}
         rows = list(client.pages(path_of("environments", environment, "versions"), page, limit=limit))
@@ -29,12 +35,12 @@ def versions(
         output.show_json(rows)
         return
     output.show_table(
-        ("version", "channels", "time", "author", "message", "changes"),
+        ("version", "channels", "time (UTC)", "author", "message", "changes"),
         (
             (
                 row["version"],
                 ", ".join(standing.get(row["version"], ())),
-                row.get("time"),
+                _minute(row.get("time")),
                 row.get("author"),
                 row.get("message"),
                 summary(row.get("changes") or {}),
@@ -64,9 +70,6 @@ def diff(
         for line in _lines(layer, change):
             output.show(line)
             lines += 1
-    if "datum" in told:
-        output.show(f"datum: {told['datum']}")
-        lines += 1
     if not lines:
         output.show(f"versions {told.get('from', old)} and {told.get('to', new)} hold the same")
 
@@ -82,7 +85,7 @@ def promote(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Move a channel to a version: forward to roll out, back to roll back."""
+    """Move a channel to a version: roll out, roll back."""
     with Client(server, token) as client:
         number = resolve(client, environment, version)
         body = {"version": number, "activate_at": at}
@@ -103,7 +106,10 @@ def revert(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Make a new version with the content of an old one. Nothing is deleted."""
+    """Make a new version with an old one's content.
+
+    Nothing is deleted.
+    """
     with Client(server, token) as client:
         number = resolve(client, environment, version)
         body = {"revert_to": number, "message": message or f"revert to version {number}"}
@@ -138,11 +144,21 @@ def channel_rows(client: Client, environment: str) -> list[dict[str, Any]]:
 
 def summary(changes: Mapping[str, Any]) -> str:
     """A version's changes in a few words."""
-    return "; ".join(f"{what}: {counts(change)}" for what, change in changes.items())
+    return "; ".join(change_line(what, change) for what, change in changes.items())
+
+
+def change_line(what: str, change: Any) -> str:
+    """What changed and how: ``topology: 2 added``, ``datum: none → 53.25, -0.5``."""
+    if what == "datum" and isinstance(change, Mapping):
+        return f"datum: {_datum(change.get('from'))} → {_datum(change.get('to'))}"
+    return f"{what}: {counts(change)}"
 
 
 def counts(change: Any) -> str:
-    """One change in a few words: ``2 added, 1 deleted``. Boxes and zeros are left out."""
+    """One change in a few words: ``2 added, 1 deleted``. Boxes and zeros are left out.
+
+    ``file header`` is what a file says as a whole, beside its items.
+    """
     if not isinstance(change, Mapping):
         return str(change)
     parts = []
@@ -152,12 +168,15 @@ def counts(change: Any) -> str:
         elif isinstance(value, float):
             parts.append(f"{name} {value:.7g}")
         elif value and not isinstance(value, list):
-            parts.append(name if value is True else f"{value} {name}")
+            flag = "file header" if name == "document" else name
+            parts.append(flag if value is True else f"{value} {name}")
     return ", ".join(parts) or "unchanged"
 
 
 def _lines(layer: str, change: Mapping[str, Any]) -> list[str]:
     """A layer's differences: of features by id, of grids by name with the cells counted."""
+    if layer == "datum":
+        return [f"~ {change_line(layer, change)}"]
     if not any(isinstance(change.get(kind), list) for kind in ("added", "changed", "deleted")):
         return [f"~ {layer} {name}: {counts(grid)}" for name, grid in change.items() if grid]
     lines = [f"+ {layer} {item}" for item in change.get("added", [])]
@@ -165,3 +184,28 @@ def _lines(layer: str, change: Mapping[str, Any]) -> list[str]:
         fields = ", ".join(item.get("fields") or ())
         lines.append(f"~ {layer} {item['id']}{f': {fields}' if fields else ''}")
     return lines + [f"- {layer} {item}" for item in change.get("deleted", [])]
+
+
+def _environments(limit: int, server: str | None, token: str | None, *, as_json: bool) -> None:
+    """All environments that the token may see, by name."""
+    with Client(server, token) as client:
+        rows = list(client.pages("/environments", {"limit": min(limit, 100)}, limit=limit))
+    if as_json:
+        output.show_json(rows)
+        return
+    output.show_table(
+        ("environment", "version", "changed (UTC)", "title"),
+        ((row["name"], row["version"], _minute(row.get("updated")), row.get("title")) for row in rows),
+    )
+
+
+def _minute(time: Any) -> str:
+    """RFC 3339 as the API tells it (UTC), to the minute: ``2026-05-01 08:30``."""
+    return str(time or "")[:16].replace("T", " ")
+
+
+def _datum(datum: Any) -> str:
+    if not isinstance(datum, Mapping):
+        return "none"
+    heading = datum.get("heading")
+    return f"{datum.get('latitude')}, {datum.get('longitude')}{f', heading {heading:g}°' if heading else ''}"

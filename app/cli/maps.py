@@ -11,7 +11,7 @@ import typer
 from app.cli import folder as folders
 from app.cli import options, output, write
 from app.cli.client import Client, Download, LocalFile, Refused, path_of
-from app.cli.history import channel_rows, counts
+from app.cli.history import change_line, channel_rows
 from app.errors import Invalid, NotFound
 from app.model.frame import GROUND, Datum
 
@@ -46,6 +46,8 @@ def import_maps(
     """
     where = options.datum(datum)
     extra = options.pairs(option)
+    if environment is not None:
+        folders.check_name(environment)
     files, suggested, notes = _collect(paths)
     name = environment or suggested
     if name is None:
@@ -84,7 +86,9 @@ def export_map(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Get a map in any format that its layers give, and tell what was derived, filled in or dropped.
+    """Get a map in any format that its layers give.
+
+    What was derived, filled in or dropped on the way is told on standard error.
 
     A map of several files becomes a folder where -o names one, else a ZIP. Without -o it is written here, under the
     server's name for it.
@@ -153,7 +157,10 @@ def convert(
 
 
 def list_formats(as_json: options.Json = False) -> None:
-    """All formats that are read and served, with their options. Needs no server."""
+    """What can be read and served, with options.
+
+    Needs no server.
+    """
     from app import formats
     from app.api.formats import as_dict
 
@@ -182,7 +189,10 @@ def coverage(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Which formats an environment's maps can be had in: directly, by deriving, or what is missing."""
+    """Which formats an environment can be had in.
+
+    Directly, by deriving, or not yet: then with what to supply.
+    """
     with Client(server, token) as client:
         rows = client.get(path_of("environments", environment, "versions", version, "maps"))
     if as_json:
@@ -249,7 +259,7 @@ def _ensure(client: Client, name: str, paths: Sequence[Path], datum: Datum | Non
             detail = f"there is no environment {name} yet, and a dry run does not create it"
             raise Refused({"title": "No such environment", "detail": detail}, status=404) from refused
         title = paths[0].resolve().name if len(paths) == 1 and paths[0].is_dir() else ""
-        body: dict[str, Any] = {"name": name, "title": title or None}
+        body: dict[str, Any] = {"name": name, "title": title if title != name else None}
         body["datum"] = datum.as_dict() if datum else None
         client.post("/environments", body)
         return True
@@ -270,20 +280,23 @@ def _show_import(name: str, status: int, body: Mapping[str, Any], *, dry_run: bo
         output.show(f"{name}: version {body['version']}{' of the new environment' if made else ''}")
     else:
         output.show(f"{name}: nothing changed, version {body['version']} stays")
-    changes = [(what, change) for what, change in (body.get("changes") or {}).items()]
-    for what, change in changes:
-        output.show(f"  {what}: {counts(change)}")
-    told = [f"{layer} {kind}" for layer, kind in (body.get("information") or {}).items() if kind != "missing"]
-    if told:
-        output.show(f"  holds: {', '.join(told)}")
+    if dry_run or status == 201:  # else they are those of the version that stays
+        for what, change in (body.get("changes") or {}).items():
+            output.show(f"  {change_line(what, change)}")
+    kinds = [f"{layer} {kind}" for layer, kind in (body.get("information") or {}).items() if kind != "missing"]
+    if kinds:
+        output.show(f"  holds: {', '.join(kinds)}")
     sources = body.get("sources") or []
     used = [s for s in sources if s.get("used")]
-    output.show(f"  files: {len(used)} used, {len(sources) - len(used)} kept as sources only")
+    idle = [s for s in sources if not s.get("used")]
+    empty = sum(not s["size"] for s in idle)
+    note = f" ({empty} of them empty)" if empty else ""
+    output.show(f"  files: {len(used)} used, {len(idle)} kept as sources only{note}")
     for source in used:
         output.show(f"    {source['name']} ({source.get('format') or 'part of a map'}, {output.size(source['size'])})")
-    idle = [s["name"] for s in sources if not s.get("used") and s["size"]]
-    if idle:
-        output.show(f"  not used: {', '.join(idle[:20])}{f' and {len(idle) - 20} more' if len(idle) > 20 else ''}")
+    names = [s["name"] for s in idle if s["size"]]
+    if names:
+        output.show(f"  not used: {', '.join(names[:20])}{f' and {len(names) - 20} more' if len(names) > 20 else ''}")
     output.show_warnings(body.get("warnings") or ())
 
 

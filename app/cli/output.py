@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -20,6 +21,15 @@ from rich.text import Text
 
 PIPED_WIDTH = 160
 """Columns where the output is no terminal that could tell its own width."""
+
+WORD = 13
+"""Characters: words up to this length are not broken in tables."""
+
+GAP = 2
+"""Blanks between the columns of a table."""
+
+NAMED = 3
+"""Files that one line of warning names where many have the same."""
 
 
 def _console(*, stderr: bool) -> Console:
@@ -50,13 +60,44 @@ def show_json(value: Any) -> None:
 
 
 def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, title: str | None = None) -> None:
-    """A table on standard output."""
+    """A table on standard output. What identifies a row stays in one line where there is room; long texts wrap."""
+    console = _console(stderr=False)
+    cells = [[plain(cell) for cell in row] for row in rows]
     table = Table(title=Text(plain(title)) if title else None, box=None, pad_edge=False, title_justify="left")
-    for column in columns:
-        table.add_column(column, style="bold" if column == columns[0] else None, overflow="fold")
-    for row in rows:
-        table.add_row(*(Text(plain(cell)) for cell in row))
-    _console(stderr=False).print(table)
+    texts = [list(column) for column in zip(columns, *cells, strict=True)]
+    for number, width in enumerate(_widths(texts, console.width)):
+        style = "bold" if number == 0 else None
+        table.add_column(columns[number], style=style, overflow="fold", width=width)
+    for row in cells:
+        table.add_row(*(Text(cell) for cell in row))
+    console.print(table)
+
+
+def _widths(columns: Sequence[Sequence[str]], room: int) -> list[int]:
+    """How wide each column of a table is, in characters of a terminal with ``room`` of them.
+
+    Each gets a word's width. The first column, then the narrowest ones, get all that they need while that leaves the
+    others half of the room; these share it.
+    """
+    full = [max(map(cell_len, texts)) for texts in columns]
+    words = [max((cell_len(word) for text in texts for word in text.split()), default=1) for texts in columns]
+    widths = [max(1, min(WORD, word)) for word in words]
+    left = room - GAP * (len(columns) - 1) - sum(widths)
+    while left < 0 and max(widths) > 1:  # a narrow terminal: even words are broken
+        widths[widths.index(max(widths))] -= 1
+        left += 1
+    for number in sorted(range(len(columns)), key=lambda n: (n > 0, full[n])):
+        more = max(0, full[number] - widths[number])
+        if more <= (left if number == 0 else left // 2):
+            widths[number] += more
+            left -= more
+    wanting = [n for n in range(len(columns)) if widths[n] < full[n]]
+    while left > 0 and wanting:
+        for number in wanting[:left]:
+            widths[number] += 1
+            left -= 1
+        wanting = [n for n in wanting if widths[n] < full[n]]
+    return widths
 
 
 def place(problem: Mapping[str, Any]) -> str:
@@ -69,11 +110,19 @@ def place(problem: Mapping[str, Any]) -> str:
 
 
 def show_warnings(warnings: Sequence[Mapping[str, Any]], *, limit: int = 20) -> None:
-    """Warnings on standard error, the first of many."""
-    for warning in warnings[:limit]:
-        say(f"warning: {place(warning)}", style="yellow")
-    if len(warnings) > limit:
-        say(f"… and {len(warnings) - limit} more warnings (--json shows all)", style="yellow")
+    """Warnings on standard error, the first of many. Files that all have the same one share a line."""
+    lines: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for number, warning in enumerate(warnings):
+        whole_file = warning.get("file") and warning.get("line") is None and not warning.get("where")
+        lines.setdefault((warning.get("problem"),) if whole_file else (number,), []).append(warning)
+    told = list(lines.values())
+    for alike in told[:limit]:
+        names = ", ".join(str(w["file"]) for w in alike[:NAMED]) if len(alike) > 1 else ""
+        more = f" and {len(alike) - NAMED} more" if len(alike) > NAMED else ""
+        line = f"{len(alike)} files: {alike[0].get('problem')}: {names}{more}" if names else place(alike[0])
+        say(f"warning: {line}", style="yellow")
+    if len(told) > limit:
+        say(f"… and {sum(map(len, told[limit:]))} more warnings (--json shows all)", style="yellow")
 
 
 def show_problem(problem: Mapping[str, Any], *, hint: str = "", as_json: bool = False, limit: int = 50) -> None:

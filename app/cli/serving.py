@@ -42,7 +42,9 @@ DEMO_TOKEN = "demo-token"  # noqa: S105  the name of a file
 
 
 def serve(*, demo: bool = False, **values: Any) -> None:
-    """Start the server in the foreground; it stops cleanly on SIGTERM and Ctrl-C.
+    """Start the server.
+
+    It runs in the foreground and stops cleanly on SIGTERM and Ctrl-C.
 
     Every option is also a setting: FLEETMAP_… in the environment or in a file .env, or a file fleetmap_… in the folder
     that FLEETMAP_SECRETS_DIR names.
@@ -75,7 +77,10 @@ def migrate(
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Bring the database to this release's schema: PostgreSQL before the server starts, SQLite at any time."""
+    """Bring the database to this release's schema.
+
+    PostgreSQL needs it before the server of a new release starts; SQLite is brought up at each start anyway.
+    """
     settings = load_settings({"database_url": database_url, "data_dir": data_dir})
     with output.progress_bar("migrating"), _store(settings) as store:
         store.migrate()
@@ -87,7 +92,10 @@ def migrate(
 
 
 def demo(server: options.Server = None, token: options.Token = None, as_json: options.Json = False) -> None:
-    """Put the small demo environment on a running server. Doing it again changes nothing."""
+    """Put the demo environment on a running server.
+
+    Doing it again changes nothing.
+    """
     from app.cli import demo as orchard
 
     with Client(server, token) as client:

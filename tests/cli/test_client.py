@@ -164,8 +164,16 @@ def test_a_missing_token_gets_a_hint(talk: Talk) -> None:
     client, script = talk(reply(401, {"detail": "x"}, "application/problem+json"), token="secret-token")
     with pytest.raises(Refused) as caught:
         client.get("/formats")
-    assert "expired" in caught.value.hint
+    assert "another" in caught.value.hint
     assert script.asked[-1][2]["Authorization"] == "Bearer secret-token"
+
+
+def test_a_missing_environment_gets_a_hint(talk: Talk) -> None:
+    problem = {"title": "Not found", "detail": "there is no environment 'x'"}
+    client, _ = talk(reply(404, problem, "application/problem+json"))
+    with pytest.raises(Refused) as caught:
+        client.get("/environments/x")
+    assert "fleetmap versions" in caught.value.hint
 
 
 def test_another_kind_of_server_is_recognised(talk: Talk) -> None:

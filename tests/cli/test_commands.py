@@ -82,6 +82,14 @@ def test_versions_diff_promote_and_revert(fleetmap: Fleetmap, network: Path, tmp
     assert len(fleetmap("versions", "story", "-n", "2", "--json").json) == 2
 
 
+def test_all_environments_are_listed(fleetmap: Fleetmap, network: Path) -> None:
+    assert fleetmap("import", network, "-e", "listed-farm").status == 0
+    rows = {row["name"]: row for row in fleetmap("versions", "--json").json}
+    assert rows["listed-farm"]["version"] == 1
+    assert "listed-farm" in fleetmap("versions", "--limit", "100").out
+    assert len(fleetmap("versions", "--limit", "1", "--json").json) == 1
+
+
 def test_a_planned_promotion_waits(fleetmap: Fleetmap, network: Path) -> None:
     history(fleetmap, network, "planned")
     told = fleetmap("promote", "planned", "2", "--channel", "staging", "--at", "2099-01-31T06:00:00Z", "--json")
@@ -192,7 +200,12 @@ def test_usage_errors_have_their_own_status(fleetmap: Fleetmap, network: Path, t
     assert fleetmap("nonsense").status == 2
     assert fleetmap("import", tmp_path / "absent", "-e", "x").status == 1
     assert "absent does not exist" in fleetmap("import", tmp_path / "absent", "-e", "x").err
-    assert fleetmap("versions", "no-such-place").status == 1
+    missing = fleetmap("versions", "no-such-place")
+    assert missing.status == 1
+    assert "lists all" in missing.err
+    named = fleetmap("import", network, "-e", "My Farm")
+    assert named.status == 1
+    assert "try my-farm" in named.err
 
 
 def test_an_option_that_nobody_knows_is_refused(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:

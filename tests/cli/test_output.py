@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from app.cli import output
-from app.cli.history import counts
+from app.cli.history import change_line, counts
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,43 @@ def test_sizes_and_counts_in_words() -> None:
         "2.0 MB",
         "3.0 GB",
     ]
-    assert counts({"added": 2, "changed": 0, "document": True}) == "2 added, document"
+    assert counts({"added": 2, "changed": 0, "document": True}) == "2 added, file header"
     assert counts({"map": {"freed": 3, "bbox": [0, 0, 1, 1]}}) == "map (3 freed)"
-    assert counts({"to": {"latitude": 53.25, "longitude": -0.5}}) == "to (latitude 53.25, longitude -0.5)"
     assert counts({"added": 0}) == "unchanged"
+    here, turned = {"latitude": 53.25, "longitude": -0.5}, {"latitude": 53.25, "longitude": -0.5, "heading": 12.5}
+    assert change_line("datum", {"from": None, "to": here}) == "datum: none → 53.25, -0.5"
+    assert change_line("datum", {"from": here, "to": turned}) == "datum: 53.25, -0.5 → 53.25, -0.5, heading 12.5°"
+
+
+def test_files_with_the_same_warning_share_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    alike = [{"file": f"f{k}.stl", "problem": "no format reads this file"} for k in range(5)]
+    output.show_warnings([*alike, {"file": "a.yaml", "line": 3, "problem": "is odd"}])
+    assert capsys.readouterr().err.splitlines() == [
+        "warning: 5 files: no format reads this file: f0.stl, f1.stl, f2.stl and 2 more",
+        "warning: a.yaml:3: is odd",
+    ]
+    output.show_warnings([{"problem": f"p{k}"} for k in range(30)], limit=20)
+    told = capsys.readouterr().err
+    assert "p19" in told
+    assert "p20" not in told
+    assert "10 more warnings" in told
+
+
+def test_a_table_keeps_names_whole_and_wraps_long_texts(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, reason = "riseholme_general_east_pathway", "upload an OSM file or a drawing with layer=topology " * 3
+    row = (name, "1", "2026-05-01 08:30", reason)
+    for columns in (12, 30, 60, 79, 80, 81, 160):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        output.show_table(("environment", "version", "time (UTC)", "reason"), [row])
+        told = capsys.readouterr().out
+        assert max(map(len, told.splitlines())) <= columns
+        if columns >= 80:
+            assert name in told
+            assert "2026-05-01 08:30" in told
+        if columns >= 60:
+            assert all(word in told for word in reason.split() if len(word) <= output.WORD)
+        assert sorted("".join(told.split())) == sorted(
+            "".join(("environment", "version", "time(UTC)", "reason", *row)).replace(" ", "")
+        ), "nothing is cut off"
