@@ -16,6 +16,8 @@ the values from libyaml's events. Tests hold that both agree.
 Refused, each with its line: NaN and infinities, integers beyond 64 bit, duplicate keys, ``<<``, tags other than
 YAML's own scalars and collections, ``%TAG``, a second document, nesting deeper than ``Limits.yaml_depth``, more than
 ``Limits.yaml_nodes`` nodes, aliases that unfold to much more than the file, aliases to a collection that contains them.
+A format with tags of its own names their prefixes: mappings and lists so tagged come as ``Tagged``, and ``%TAG`` may
+stand for these prefixes.
 
 ``text``, ``block`` and ``mapping`` write what readers of YAML 1.1 (PyYAML) and 1.2 (yaml-cpp) take for the same value.
 """
@@ -24,7 +26,8 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -57,14 +60,32 @@ UNFOLD_FREE, UNFOLD_TIMES = 16 * 2**20, 4
 """Aliases may add this many characters, and this many times the file's size."""
 
 
-def load(data: bytes, limits: Limits) -> Any:
+class Tagged(NamedTuple):
+    """A mapping or list that carries a tag of the format's own; the tag is written out in full."""
+
+    tag: str
+    value: Any
+
+
+class Plain(str):
+    """A scalar without quotes as its text, for formats whose readers take it for one (``no``, ``010``); ``scalar`` says
+    what else it may mean."""
+
+    __slots__ = ()
+
+
+def load(data: bytes, limits: Limits, *, tags: Sequence[str] = (), typed: bool = True) -> Any:
     """The one document of a UTF-8 YAML file as JSON-like values; an empty file is None.
 
+    tags: prefixes of the format's own tags, which collections may carry. typed: whether scalars get their meaning;
+    if not, all are texts, those without quotes ``Plain``.
     Values behind aliases are shared objects: do not change them in place. Raises UnreadableFile or TooLarge, with line.
     """
     if len(data) > limits.text_bytes:
         raise TooLarge(f"the file has {len(data)} bytes of YAML; the limit is {limits.text_bytes}")
     document = _text(data)
+    if tags or not typed:
+        return _load_events(document, limits, tuple(tags), typed=typed)
     try:
         return _load_lines(document, limits)
     except _NotSimpleError:
@@ -194,14 +215,14 @@ def _tagged(tag: str, text: str) -> Any:
     return float(value) if tag == TAG + "float" else value
 
 
-def _load_events(text: str, limits: Limits) -> Any:
+def _load_events(text: str, limits: Limits, tags: tuple[str, ...] = (), *, typed: bool = True) -> Any:
     """The reference: builds the value from libyaml's event stream, without recursion."""
     loader: Any = yaml.CSafeLoader(text)
     event: Any = None
     budget = UNFOLD_FREE + UNFOLD_TIMES * len(text)
     root: list[Any] = []
-    # Open collections, outermost first: [value, pending key, is a mapping, weight, what its anchor stands for].
-    stack: list[list[Any]] = [[root, None, False, 0, None]]
+    # Open collections, outermost first: [value, pending key, is a mapping, weight, what its anchor stands for, tag].
+    stack: list[list[Any]] = [[root, None, False, 0, None, None]]
     # What each name stands for, (value, weight), empty while its collection is open. The last anchor of a name counts.
     anchors: dict[str, list[tuple[Any, int]]] = {}
     nodes = documents = 0
@@ -225,24 +246,31 @@ def _load_events(text: str, limits: Limits) -> Any:
                     value: Any = said
                 elif event.tag is not None:
                     value = _tagged(event.tag, said)
-                else:
+                elif typed:
                     value = scalar(said) if plain else said
+                else:
+                    value = Plain(said) if plain else said
                 weight = 8 + len(said)
             elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
                 nodes += 1
                 mapping = kind is yaml.MappingStartEvent
+                own = None
                 if event.tag not in (None, "!", TAG + ("map" if mapping else "seq")):
-                    raise ValueError(f"the tag {event.tag[:80]} is not supported")
+                    if not event.tag.startswith(tags):
+                        raise ValueError(f"the tag {event.tag[:80]} is not supported")
+                    own = event.tag
                 if stack[-1][2] and stack[-1][1] is None:
                     raise ValueError("a key must be a text, not a collection")
                 if len(stack) > limits.yaml_depth:
                     raise ValueError(f"nested deeper than {limits.yaml_depth} levels")
                 if event.anchor is not None:
                     held = anchors[event.anchor] = []
-                stack.append([{} if mapping else [], None, mapping, 8, held])
+                stack.append([{} if mapping else [], None, mapping, 8, held, own])
                 continue
             elif kind is yaml.MappingEndEvent or kind is yaml.SequenceEndEvent:
-                value, _, _, weight, held = stack.pop()
+                value, _, _, weight, held, own = stack.pop()
+                if own is not None:
+                    value = Tagged(own, value)
             elif kind is yaml.AliasEvent:
                 if event.anchor not in anchors:
                     raise ValueError(f"the alias *{event.anchor[:80]} has no anchor before it")
@@ -257,8 +285,8 @@ def _load_events(text: str, limits: Limits) -> Any:
                 documents += 1
                 if documents > 1:
                     raise ValueError("a second document begins here; only one is read")
-                if event.tags:
-                    raise ValueError("%TAG directives are not supported")
+                if event.tags and not set(event.tags.values()) <= set(tags):
+                    raise ValueError("%TAG directives are not supported" if not tags else "an unknown %TAG directive")
                 continue
             elif kind is yaml.StreamEndEvent:
                 break

@@ -1,0 +1,259 @@
+"""What formats of networks share: names as ids, poses of nodes, and all networks of an environment as one.
+
+Nodes are points and edges directed lines between them (see ``app.model.features``); metres in the local frame.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NoReturn
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import Problem, UnreadableFile
+from app.formats import WriteContext
+from app.model.features import Features, Properties, unique_ids
+from app.model.frame import is_writable
+from app.model.layers import Layers
+
+Array = NDArray[np.float64]
+
+MAX_NAME = 256
+LONGEST_ID = 480
+
+SAME_ANGLE = 1e-9
+"""Radians: a quaternion made from an angle gives it back this exactly."""
+
+AMONG_PARTS = frozenset({"drawn_from"})
+"""Canonical properties that speak of other parts of the environment, not of the item."""
+
+
+def refuse(reason: str, where: str) -> NoReturn:
+    """UnreadableFile for what stands at this key."""
+    raise UnreadableFile(f"{where}: {reason}", [Problem(reason, where=where)])
+
+
+def checked_name(said: str, where: str) -> str:
+    """A name that can stand in one line of any format."""
+    if not 0 < len(said) <= MAX_NAME or not is_writable(said):
+        refuse(f"a name must have 1 to {MAX_NAME} characters and no control characters, got {said[:60]!r}", where)
+    return said
+
+
+def identifier(name: str) -> str:
+    """The name as an id, or where it is too long for one its beginning and a hash of all of it."""
+    if len(name) <= LONGEST_ID:
+        return name
+    return f"{name[: LONGEST_ID - 17]}~{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+
+
+def number(value: Any, where: str) -> float:
+    """A finite number; refused are texts, booleans and what is too large for a float."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        refuse(f"{str(value)[:60]!r} is not a number", where)
+    if not math.isfinite(value):
+        refuse("the number is not finite", where)
+    return float(value)
+
+
+def some(names: Sequence[Any]) -> str:
+    """The first of the names, for a message."""
+    return ", ".join(map(str, names[:5])) + (" …" if len(names) > 5 else "")
+
+
+def natural(name: str) -> tuple[int, str]:
+    """Sorts WayPoint9 before WayPoint10."""
+    return len(name), name
+
+
+def node_points(xyz: Array) -> NDArray[np.object_]:
+    """Points from [n, 3], two-dimensional where z is 0."""
+    out = np.asarray(shapely.points(xyz[:, :2]), object).reshape(len(xyz))
+    high = xyz[:, 2] != 0
+    if high.any():
+        out[high] = shapely.points(xyz[high])
+    return out
+
+
+def edge_lines(xyz: Array, sources: Sequence[int], targets: Sequence[int]) -> NDArray[np.object_]:
+    """Lines of two points between the places of nodes, two-dimensional where both lie at 0."""
+    ends = np.stack([xyz[np.array(sources, np.intp)], xyz[np.array(targets, np.intp)]], axis=1)
+    out: NDArray[np.object_] = np.empty(len(ends), object)
+    high = (ends[:, :, 2] != 0).any(axis=1)
+    if not high.all():
+        out[~high] = shapely.linestrings(ends[~high][:, :, :2])
+    if high.any():
+        out[high] = shapely.linestrings(ends[high])
+    return out
+
+
+def quaternion(yaw: float) -> list[float]:
+    """[x, y, z, w] of a turn about z by this angle in radians."""
+    return [0.0, 0.0, math.sin(yaw / 2.0) + 0.0, math.cos(yaw / 2.0) + 0.0]
+
+
+def yaw(orientation: Any) -> float | None:
+    """The angle about z in radians, -π to π, of a quaternion [x, y, z, w]; None where it is none."""
+    if not isinstance(orientation, (list, tuple)) or len(orientation) != 4:
+        return None
+    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in orientation):
+        return None
+    x, y, z, w = map(float, orientation)
+    length = x * x + y * y + z * z + w * w
+    if not 1e-12 < length < 1e12:
+        return None
+    return math.atan2(2.0 * (w * z + x * y), length - 2.0 * (y * y + z * z))
+
+
+def is_flat(orientation: Any) -> bool:
+    """Whether a quaternion only turns about z."""
+    return yaw(orientation) is None or max(abs(orientation[0]), abs(orientation[1])) < SAME_ANGLE
+
+
+def said_yaw(said: Any, orientation: Any) -> float | None:
+    """The angle of a quaternion in radians: as its source said it where that is the same angle, else from -π to π."""
+    now = yaw(orientation)
+    if now is None:
+        return None
+    known = isinstance(said, (int, float)) and not isinstance(said, bool)
+    return said if known and abs(math.remainder(said - now, math.tau)) < SAME_ANGLE else round(now, 12) + 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """A directed edge: its id, the places of its nodes in ``Net.nodes``, and its shape in metres."""
+
+    id: str
+    source: int
+    target: int
+    properties: Properties
+    geometry: Any
+    level: str
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A node: an id that is the only one in all networks, and where it stands in metres; z is None in 2-D."""
+
+    id: str
+    x: float
+    y: float
+    z: float | None
+    properties: Properties
+    level: str
+
+
+@dataclass(slots=True)
+class Net:
+    """All networks of an environment as one; ids of nodes are distinct, and so are those of edges."""
+
+    nodes: list[Node] = field(default_factory=list)
+    edges: list[Edge] = field(default_factory=list)
+    levels: list[str] = field(default_factory=list)
+
+    @property
+    def bends(self) -> int:
+        """How many edges are not straight."""
+        return sum(shapely.get_num_coordinates(e.geometry) > 2 for e in self.edges)
+
+
+def joined(layers: Layers, context: WriteContext) -> Net:
+    """All networks, nodes and edges in the order of their parts. MissingDatum where one is on earth without a datum.
+
+    Edges find their nodes in their own part first, then in another one. What is neither a node with a point nor an
+    edge between nodes is declared as dropped; ids that several networks use get a number, with a warning.
+    """
+    net = Net()
+    homes: list[dict[str, int]] = []
+    everywhere: dict[str, int] = {}
+    taken: set[str] = set()
+    renamed: list[str] = []
+    strange = 0
+    parts = layers.vector("topology")
+    shapes = {}
+    for key, part in parts.items():
+        geometry = shapes[key] = part.in_local(layers.frame)
+        is_point = (shapely.get_type_id(geometry) == 0) & ~shapely.is_empty(geometry)
+        places = [k for k in np.flatnonzero(is_point).tolist() if part.properties[k].get("kind") == "node"]
+        strange += sum(p.get("kind") != "edge" for p in part.properties) - len(places)
+        said = [part.ids[k] for k in places]
+        ids = unique_ids(said, taken)
+        renamed += [a for a, b in zip(said, ids, strict=True) if a != b]
+        taken.update(ids)
+        home = dict(zip(said, range(len(net.nodes), len(net.nodes) + len(said)), strict=True))
+        homes.append(home)
+        everywhere = {**home, **everywhere}
+        xyz = shapely.get_coordinates(geometry[places], include_z=True)
+        for k, i, (x, y, z) in zip(places, ids, xyz.tolist(), strict=True):
+            net.nodes.append(Node(i, x, y, None if math.isnan(z) else z, part.properties[k], key.level))
+        net.levels.append(key.level)
+    lost = _join_edges(net, parts, shapes, homes, everywhere)
+    if renamed:
+        context.warn(f"{len(renamed)} ids stand in several networks and got a number: {some(renamed)}")
+    context.drop("items that are neither a node with a point nor an edge", strange, "they are no part of a network")
+    context.drop("edges that begin or end at no node", lost, "there is nothing that they could join")
+    return net
+
+
+def _join_edges(net: Net, parts: Any, shapes: Any, homes: list[dict[str, int]], everywhere: dict[str, int]) -> int:
+    taken: set[str] = set()
+    lost = 0
+    for (key, part), home in zip(parts.items(), homes, strict=True):
+        rows: list[tuple[int, int, int]] = []
+        for k, p in enumerate(part.properties):
+            if p.get("kind") != "edge":
+                continue
+            ends = [p.get("source"), p.get("target")]
+            found = [home.get(e, everywhere.get(e)) if isinstance(e, str) else None for e in ends]
+            if found[0] is None or found[1] is None:
+                lost += 1
+            else:
+                rows.append((k, found[0], found[1]))
+        ids = unique_ids((part.ids[k] for k, _, _ in rows), taken)
+        taken.update(ids)
+        for (k, source, target), i in zip(rows, ids, strict=True):
+            net.edges.append(Edge(i, source, target, part.properties[k], shapes[key][k], key.level))
+    return lost
+
+
+def known_document(layers: Layers, name: str) -> dict[str, Any]:
+    """What the first network's source of this format says as a whole; empty where there is none."""
+    for part in layers.vector("topology").values():
+        said = part.document.get(name)
+        if isinstance(said, dict):
+            return dict(said)
+    return {}
+
+
+def own(properties: Properties, name: str) -> dict[str, Any]:
+    """What a format knows of an item; empty where it knows nothing."""
+    said = properties.get(name)
+    return said if isinstance(said, dict) else {}
+
+
+def only_2d(net: Net, context: WriteContext, why: str) -> None:
+    """Declare what a flat format without levels loses."""
+    context.drop("altitudes of nodes", sum(bool(n.z) for n in net.nodes), why)
+    if len(set(net.levels)) > 1:
+        context.drop("levels of nodes", len(net.nodes), "all networks are joined into one")
+
+
+def without_repeats(names: Sequence[str]) -> list[str]:
+    """The names that stand more than once, each once, in order."""
+    seen: set[str] = set()
+    again: dict[str, None] = {}
+    for name in names:
+        if name in seen:
+            again[name] = None
+        seen.add(name)
+    return list(again)
+
+
+def empty(document: Properties) -> Features:
+    """A part without items that keeps what its source says as a whole."""
+    return Features((), np.empty(0, object), (), np.empty(0, bool), document)

@@ -1,0 +1,582 @@
+"""navgraph: the navigation graphs of the Fawkes robot framework, as YAML 1.2 with tags.
+
+Nodes have a name, a position [x, y] in metres and properties; connections join two nodes in both directions, with
+``!dir`` in one. To Fawkes every scalar is a text and a property without a value (a bare word) is ``true``. How it adds
+a connection that crosses others: it refuses (the default, ``!no-intersection``), adds it all the same
+(``!allow-intersection``) or makes a node of the crossing (``!split-intersection``). A node that no connection reaches
+must be ``!unconnected``.
+Source: fawkes, src/libs/navgraph/yaml_navgraph.cpp and navgraph.cpp.
+
+Canonical: a node's id is its name, an edge's ``<from>_<to>``; a connection of both directions is two edges, the second
+with ``backward``. The property ``orientation`` (radians) is the node's orientation too. ``properties.navgraph`` holds a
+node's ``properties`` (a mapping), ``words`` (which of them are bare), ``tag`` and ``more`` (further keys); a
+connection's ``tag``, ``backward`` and, where the file has intersection tags, ``order``: with these Fawkes adds one
+connection after the other, and the result depends on it. The document's ``navgraph`` holds ``top`` (the keys of the
+file but nodes and connections), ``defaults`` and ``words`` of the default properties.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.errors import Problem, UnreadableFile
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _yaml, register
+from app.formats._network import (
+    AMONG_PARTS,
+    Array,
+    Edge,
+    Net,
+    Node,
+    checked_name,
+    edge_lines,
+    identifier,
+    is_flat,
+    joined,
+    known_document,
+    natural,
+    node_points,
+    number,
+    only_2d,
+    own,
+    quaternion,
+    refuse,
+    said_yaw,
+    some,
+    without_repeats,
+)
+from app.formats._text import METRES, numbers
+from app.model.features import Properties, from_columns, unique_ids
+from app.model.layers import NETWORK, Layers, PartKey
+
+NAME = "navgraph"
+PREFIX = "tag:fawkesrobotics.org,navgraph/"
+TAGS = (PREFIX, "!")
+"""Our tags with Fawkes' %TAG line, and without it (then Fawkes does not know them)."""
+
+DIRECTED, UNCONNECTED, CROSSING = "dir", "unconnected", "allow-intersection"
+MODES = frozenset({CROSSING, "no-intersection", "split-intersection"})
+KNOWN_TAGS = MODES | {DIRECTED, "bidir"}
+
+_WORD = re.compile(r"[A-Za-z0-9_-]{1,64}\Z")
+
+NODE_KEYS = frozenset({"name", "pos", "properties"})
+CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME}) | AMONG_PARTS
+CANONICAL_EDGE = frozenset({"kind", "source", "target", NAME}) | AMONG_PARTS
+
+MANY_CROSSINGS = 50
+"""Crossings a connection on average: a network with more is a scribble, and each is taken for crossing."""
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """The graph as topology, local metres. Raises UnreadableFile naming the node or connection."""
+    if not context.wants("topology"):
+        return Layers()
+    data = files[context.main or next(iter(files))]
+    top = _yaml.load(data, context.limits, tags=TAGS, typed=False)
+    if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
+        raise UnreadableFile("there is no list of nodes: not a navgraph", [Problem("no list", where="nodes")])
+    nodes = [_Read(item, k, context) for k, item in enumerate(top["nodes"])]
+    names = [node.name for node in nodes]
+    ids = unique_ids(map(identifier, names))
+    if again := without_repeats(names):
+        context.warn(f"{len(again)} names stand twice or more: {some(again)}; Fawkes refuses that; the first is meant")
+    place = {name: k for k, name in reversed(list(enumerate(names)))}
+    rows, dangling = _connections(top.get("connections"), place, context)
+    xyz: Array = np.array([(*node.at, 0.0) for node in nodes], np.float64).reshape(-1, 3)
+    properties: list[Properties] = []
+    for k, (node, i) in enumerate(zip(nodes, ids, strict=True)):
+        said = node.canonical(i)
+        if k in dangling:
+            said[NAME]["dangling"] = dangling[k]
+        properties.append(said)
+    edges = unique_ids((identifier(f"{ids[a]}_{ids[b]}") for a, b, _ in rows), set(ids))
+    properties += [{"kind": "edge", "source": ids[a], "target": ids[b], NAME: rest} for a, b, rest in rows]
+    geometry = np.concatenate([node_points(xyz), edge_lines(xyz, [r[0] for r in rows], [r[1] for r in rows])])
+    document = {NAME: _document(top, set(names), context)}
+    if -1 in dangling:
+        document[NAME]["dangling"] = dangling[-1]
+    part = from_columns([*ids, *edges], geometry, properties, "local", document)
+    return Layers({PartKey("topology", context.level, NETWORK): part})
+
+
+class _Read:
+    """One node of the file."""
+
+    def __init__(self, item: Any, k: int, context: ReadContext) -> None:
+        where = f"nodes[{k}]"
+        self.tag, entry = _untag(item, where, context)
+        if not isinstance(entry, dict):
+            refuse("a node must be a mapping with a name and a pos", where)
+        if "name" not in entry:
+            refuse("a node must have a name", where)
+        self.name = checked_name(_name(entry["name"], f"{where}.name"), f"{where}.name")
+        self.where = self.name
+        if self.tag not in (None, UNCONNECTED):
+            context.warn(f"Fawkes does not know the tag !{self.tag} of a node", where=self.where)
+        at = entry.get("pos")
+        if not isinstance(at, list) or len(at) != 2:
+            refuse("pos must be [x, y]", f"{self.where}.pos")
+        self.at = tuple(number(_plain(v, f"{self.where}.pos"), f"{self.where}.pos") for v in at)
+        said = entry.get("properties")
+        self.properties, self.words = _properties(said, f"{self.where}.properties", context)
+        self.more = {key: _plain(value, f"{self.where}.{key}") for key, value in entry.items() if key not in NODE_KEYS}
+
+    def canonical(self, i: str) -> dict[str, Any]:
+        """Its properties in the canonical layer."""
+        rest: dict[str, Any] = {}
+        out: dict[str, Any] = {"kind": "node", "name": self.name, NAME: rest}
+        properties = dict(self.properties)
+        display = properties.get("name")
+        if isinstance(display, str) and display not in ("", self.name) and "name" not in self.words:
+            out["name"] = display
+            del properties["name"]
+        turned = properties.get("orientation")
+        if isinstance(turned, (int, float)) and not isinstance(turned, bool):
+            out["orientation"] = quaternion(float(turned))
+        if self.name != i:
+            rest["name"] = self.name
+        kept = {"tag": self.tag, "properties": properties, "words": self.words, "more": self.more}
+        rest |= {key: value for key, value in kept.items() if value}
+        return out
+
+
+def _untag(item: Any, where: str, context: ReadContext) -> tuple[str | None, Any]:
+    """(the tag's own name, the value)."""
+    if not isinstance(item, _yaml.Tagged):
+        return None, item
+    tag = item.tag.removeprefix(PREFIX) if item.tag.startswith(PREFIX) else item.tag[1:]
+    if not _WORD.match(tag):
+        refuse(f"{item.tag[:80]!r} cannot be a tag: letters, digits, - and _ can", where)
+    if not item.tag.startswith(PREFIX):
+        context.warn(f"the tag !{tag} needs the line '%TAG ! {PREFIX}' for Fawkes to know it", where=where)
+    return tag, item.value
+
+
+def _name(value: Any, where: str) -> str:
+    """A scalar as the text that it is for Fawkes."""
+    if not isinstance(value, str):
+        refuse("must be a text", where)
+    return str.__str__(value)
+
+
+def _plain(value: Any, where: str) -> Any:
+    """A value as JSON-like data; scalars without quotes get their meaning."""
+    if isinstance(value, _yaml.Plain):
+        try:
+            return _yaml.scalar(str.__str__(value))
+        except ValueError as error:
+            refuse(str(error), where)
+    if isinstance(value, _yaml.Tagged):
+        refuse(f"the tag {value.tag[:80]} has no meaning here", where)
+    if isinstance(value, dict):
+        return {key: _plain(v, where) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_plain(v, where) for v in value]
+    return value
+
+
+def _properties(said: Any, where: str, context: ReadContext) -> tuple[dict[str, Any], list[str]]:
+    """(a list of one-key mappings and bare words as a mapping, the bare words, sorted)."""
+    if said is None or said == "":
+        return {}, []
+    if isinstance(said, dict):
+        context.warn("must be a list of one-key mappings for Fawkes; a list is served", where=where)
+        said = [said]
+    if not isinstance(said, list):
+        refuse("must be a list of words and one-key mappings", where)
+    out: dict[str, Any] = {}
+    words: set[str] = set()
+    for item in said:
+        if isinstance(item, str):
+            word = _name(item, where)
+            pairs: Sequence[tuple[str, Any]] = [(word, True)]
+        elif isinstance(item, dict):
+            pairs = [(key, _plain(value, f"{where}.{key}")) for key, value in item.items()]
+        else:
+            refuse("must be a list of words and one-key mappings", where)
+        for key, value in pairs:
+            if key in out:
+                context.warn("stands twice; the last value counts", where=f"{where}.{key}")
+            if isinstance(value, (dict, list)):
+                context.warn("is no scalar, which Fawkes refuses; it is kept", where=f"{where}.{key}")
+            out[key] = value
+            words.discard(key)
+        if isinstance(item, str):
+            words.add(word)
+    return out, sorted(words)
+
+
+Row = tuple[int, int, dict[str, Any]]
+
+
+def _connections(
+    said: Any, place: Mapping[str, int], context: ReadContext
+) -> tuple[list[Row], dict[int, list[dict[str, Any]]]]:
+    """((source, target, what only this format knows) of each edge; the connections to nowhere by their known node, by
+    -1 where both are unknown)."""
+    if said is None or said == "":
+        return [], {}
+    if not isinstance(said, list):
+        refuse("must be a list of pairs", "connections")
+    items = []
+    for k, item in enumerate(said):
+        where = f"connections[{k}]"
+        tag, pair = _untag(item, where, context)
+        if not isinstance(pair, list) or len(pair) != 2:
+            refuse("a connection is a pair of names: [from, to]", where)
+        items.append((tag, _name(pair[0], where), _name(pair[1], where), where))
+        if tag is not None and tag not in KNOWN_TAGS:
+            context.warn(f"Fawkes does not know the tag !{tag} of a connection", where=where)
+    ordered = any(tag in MODES for tag, _, _, _ in items)
+    rows: list[Row] = []
+    dangling: dict[int, list[dict[str, Any]]] = defaultdict(list)
+    seen: set[tuple[str, str]] = set()
+    for k, (tag, a, b, where) in enumerate(items):
+        rest: dict[str, Any] = {"tag": tag} if tag else {}
+        if a not in place or b not in place:
+            missing = a if a not in place else b
+            home = place.get(a, place.get(b))
+            reason = f"{a} - {b}: there is no node {missing!r}, which Fawkes refuses; it is kept, but not served"
+            context.warn(reason, where=where)
+            dangling[-1 if home is None else home].append({**rest, "ends": [a, b]})
+            continue
+        if (a, b) in seen:
+            context.warn(f"{a} - {b} stands twice, which Fawkes refuses", where=where)
+        seen |= {(a, b)} if tag == DIRECTED else {(a, b), (b, a)}
+        if a == b:
+            context.warn(f"{a} is connected with itself", where=where)
+        if ordered:
+            rest["order"] = k
+        rows.append((place[a], place[b], rest))
+        if tag != DIRECTED and a != b:
+            rows.append((place[b], place[a], {**rest, "backward": True}))
+    return rows, dangling
+
+
+def _document(top: Mapping[str, Any], names: set[str], context: ReadContext) -> dict[str, Any]:
+    """What the file says as a whole."""
+    rest = {
+        key: _name(value, key) if value and key in ("graph-name", "root") else _plain(value, key)
+        for key, value in top.items()
+        if key not in ("nodes", "connections", "default-properties")
+    }
+    if "graph-name" not in rest:
+        context.warn("is missing; Fawkes asks for it", where="graph-name")
+    if isinstance(rest.get("root"), str) and rest["root"] and rest["root"] not in names:
+        context.warn(f"{rest['root']!r} is no node", where="root")
+    out: dict[str, Any] = {"top": rest}
+    defaults, words = _properties(top.get("default-properties"), "default-properties", context)
+    if defaults:
+        out["defaults"] = defaults
+    if words:
+        out["words"] = words
+    return out
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``navgraph.yaml``: all networks of the environment as one graph, nodes sorted by length and text of their names.
+
+    Edges of both directions between two nodes are one connection. Wgs84 items are brought to local metres (MissingDatum
+    without a datum).
+    """
+    return {"navgraph.yaml": _Writer(layers, context).file().encode()}
+
+
+@dataclass(frozen=True, slots=True)
+class _Connection:
+    """A line of the file: its tag, its ends (places of nodes), whether another format's network has it."""
+
+    tag: str | None
+    a: int
+    b: int
+    foreign: bool
+    order: int | None
+
+
+class _Writer:
+    def __init__(self, layers: Layers, context: WriteContext) -> None:
+        self.context = context
+        self.document = known_document(layers, NAME)
+        self.net: Net = joined(layers, context)
+        self.names = [self._name_of(node) for node in self.net.nodes]
+        self.lost: Counter[str] = Counter()
+
+    def _name_of(self, node: Node) -> str:
+        said = own(node.properties, NAME).get("name")
+        return said if isinstance(said, str) and said else node.id
+
+    def file(self) -> str:
+        """The whole text."""
+        if again := without_repeats(self.names):
+            self.context.warn(f"{len(again)} names stand twice or more, which Fawkes refuses: {some(again)}")
+        connections = self._tagged(list(self._connections()))
+        order = self._node_order(connections)
+        out = [f"%YAML 1.2\n%TAG ! {PREFIX}\n---\n", self._head(), "nodes:" if order else "nodes: []"]
+        xy = np.array([(self.net.nodes[k].x, self.net.nodes[k].y) for k in order], np.float64).reshape(-1, 2)
+        said = list(map(_yaml.decimal, numbers(xy.ravel(), METRES)))
+        linked = {k for c in connections for k in (c.a, c.b)}
+        for k, x, y in zip(order, said[::2], said[1::2], strict=True):
+            out.append(self._node(k, x, y, linked=k in linked))
+        names = [_yaml.text(name) for name in self.names]
+        out.append("\nconnections:\n" if connections else "\nconnections: []\n")
+        for c in connections:
+            tag = f"!{c.tag} " if c.tag else ""
+            out.append(f"  - {tag}[{names[c.a]}, {names[c.b]}]\n")
+        self._report()
+        return "".join(out)
+
+    def _head(self) -> str:
+        """The keys before the nodes."""
+        said = self.document.get("top")
+        top = dict(said) if isinstance(said, dict) else {}
+        if not isinstance(top.get("graph-name"), str) or not top["graph-name"]:
+            top["graph-name"] = self.context.title
+            self.context.fill("graph-name", self.context.title, "no source names it")
+        first = {key: top.pop(key) for key in ("graph-name", "root") if key in top}
+        out = [_yaml.mapping({key: value}, 0) for key, value in first.items()]
+        if top:
+            out.append(_yaml.mapping(top, 0))
+        defaults = self.document.get("defaults")
+        if isinstance(defaults, dict) and defaults:
+            out.append("default-properties:\n" + _listed(defaults, self.document.get("words"), 2))
+        return "".join(out)
+
+    def _node(self, k: int, x: str, y: str, *, linked: bool) -> str:
+        """The text of a node, with the line break before it."""
+        node, name = self.net.nodes[k], self.names[k]
+        p = node.properties
+        rest = own(p, NAME)
+        tag = _tag(rest)
+        if NAME not in p and not linked:
+            tag = UNCONNECTED
+            self.lost["unconnected"] += 1
+        elif tag == UNCONNECTED and linked:
+            tag = None
+            self.context.warn("was !unconnected and is connected now: it is served without the tag", where=name)
+        said = rest.get("properties")
+        properties = dict(said) if isinstance(said, dict) else {}
+        turned = said_yaw(properties.get("orientation"), p.get("orientation"))
+        if turned is not None:
+            properties["orientation"] = turned
+            self.lost["tilted"] += not is_flat(p["orientation"])
+        display = p.get("name")
+        if isinstance(display, str) and display not in ("", name):
+            properties["name"] = display
+        for key in p.keys() - CANONICAL_NODE:
+            if isinstance(p[key], (str, int, float)):
+                properties.setdefault(key, p[key])
+            else:
+                self.lost["node attributes"] += 1
+        body = f"name: {_yaml.text(name)}\n    pos: [{x}, {y}]\n"
+        text = f"\n  - !{tag}\n    {body}" if tag else f"\n  - {body}"
+        if properties:
+            text += "    properties:\n" + _listed(properties, rest.get("words"), 6)
+        more = rest.get("more")
+        if isinstance(more, dict) and more:
+            text += _yaml.mapping(more, 4)
+        self.lost["dangling"] += len(rest.get("dangling") or ())
+        return text[:-1]
+
+    def _connections(self) -> Iterator[_Connection]:
+        """Edges as connections: both directions of a pair as one."""
+        edges = sorted(self.net.edges, key=lambda e: (NAME not in e.properties, natural(e.id)))
+        waiting: dict[tuple[int, int, str | None], list[tuple[Edge, dict[str, Any]]]] = defaultdict(list)
+        covered: set[tuple[int, int]] = set()
+        for edge in edges:
+            foreign = NAME not in edge.properties
+            if foreign and (edge.source, edge.target) in covered:
+                self.lost["parallel"] += 1
+                continue
+            covered.add((edge.source, edge.target))
+            self.lost["edge attributes"] += bool(edge.properties.keys() - CANONICAL_EDGE)
+            rest = own(edge.properties, NAME)
+            tag = _tag(rest)
+            order = rest.get("order") if isinstance(rest.get("order"), int) else None
+            back = waiting[(edge.target, edge.source, tag)]
+            if tag == DIRECTED or edge.source == edge.target:
+                yield _Connection(tag, edge.source, edge.target, foreign, order)
+            elif back:
+                other, its = back.pop(0)
+                first, second = (other, edge) if self._leads(other, its, edge, rest) else (edge, other)
+                yield _Connection(tag, first.source, second.source, foreign, order)
+            else:
+                waiting[(edge.source, edge.target, tag)].append((edge, rest))
+        for (a, b, tag), left in waiting.items():
+            for edge, rest in left:
+                self.lost["one-way modes"] += tag in MODES
+                order = rest.get("order") if isinstance(rest.get("order"), int) else None
+                yield _Connection(DIRECTED, a, b, NAME not in edge.properties, order)
+
+    def _leads(self, a: Edge, its: Mapping[str, Any], b: Edge, other: Mapping[str, Any]) -> bool:
+        """Whether edge a is the one that a connection of both directions is named by."""
+        backward = (bool(its.get("backward")), bool(other.get("backward")))
+        if backward[0] != backward[1]:
+            return backward[1]
+        return natural(self.names[a.source]) < natural(self.names[b.source])
+
+    def _tagged(self, connections: list[_Connection]) -> list[_Connection]:
+        """The connections in the order that Fawkes shall add them, those of other formats tagged where they cross."""
+        crossing = self._crossing(connections)
+        out = []
+        for k, c in enumerate(connections):
+            if c.foreign and crossing[k] and c.tag is None:
+                out.append((2, 0, _Connection(CROSSING, c.a, c.b, c.foreign, None)))
+            elif c.foreign or c.order is None:
+                out.append((0 if c.foreign else 1, -1, c))
+            else:
+                out.append((1, c.order, c))
+        stuck = sum(c.tag == DIRECTED and bool(crossing[k]) for k, c in enumerate(connections) if c.foreign)
+        if stuck:
+            self.context.warn(
+                f"{stuck} one-way connections cross others; a connection has one tag only, so Fawkes refuses them "
+                "where two of them cross each other"
+            )
+        names = self.names
+        out.sort(key=lambda t: (t[0], t[1], natural(names[t[2].a]), natural(names[t[2].b]), t[2].tag or ""))
+        return [c for _, _, c in out]
+
+    def _crossing(self, connections: Sequence[_Connection]) -> Sequence[bool]:
+        """Which connections touch another one that they share no node with; not looked at in Fawkes' own graphs."""
+        n = len(connections)
+        crossing = np.zeros(n, bool)
+        if not any(c.foreign for c in connections):
+            return crossing.tolist()
+        xy = np.array([(node.x, node.y) for node in self.net.nodes], np.float64)
+        ends = np.array([(c.a, c.b) for c in connections], np.intp)
+        lines = shapely.linestrings(xy[ends])
+        tree = shapely.STRtree(lines)
+        portion, found = max(1, 20_000_000 // n), 0
+        for begin in range(0, n, portion):
+            if found > MANY_CROSSINGS * n + 1_000_000:
+                crossing[begin:] = True
+                break
+            a, b = tree.query(lines[begin : begin + portion], predicate="intersects")
+            a = a + begin
+            found += len(a)
+            apart = (ends[a][:, :, None] != ends[b][:, None, :]).all(axis=(1, 2))
+            crossing[a[apart]] = True
+        return crossing.tolist()
+
+    def _node_order(self, connections: Sequence[_Connection]) -> list[int]:
+        """Places of the nodes in the file's order. Fawkes wants all of them to be reachable from the first one."""
+        names, nodes = self.names, self.net.nodes
+        order = sorted(range(len(names)), key=lambda k: natural(names[k]))
+        onward: dict[int, list[int]] = defaultdict(list)
+        linked: set[int] = set()
+        for c in connections:
+            onward[c.a].append(c.b)
+            if c.tag != DIRECTED:
+                onward[c.b].append(c.a)
+            linked |= {c.a, c.b}
+        needed = [k for k in order if k in linked or _tag(own(nodes[k].properties, NAME)) != UNCONNECTED]
+        needed = [k for k in needed if k in linked or NAME in nodes[k].properties]
+        seen: set[int] = set()
+        starts = [k for k in needed if _reach(k, onward, seen)]
+        if len(starts) > 1:
+            # Where any node reaches all, the last one that a search had to begin at does.
+            everything: set[int] = set()
+            _reach(starts[-1], onward, everything)
+            if len(everything) == len(needed):
+                order.remove(starts[-1])
+                order.insert(0, starts[-1])
+            else:
+                self.context.warn(
+                    f"no node reaches all others (from {names[starts[0]]!r} not {names[starts[1]]!r}): Fawkes refuses "
+                    "that unless it allows several graphs in one"
+                )
+        return order
+
+    def _report(self) -> None:
+        context, lost = self.context, self.lost
+        only_2d(self.net, context, "Fawkes' nodes are two-dimensional")
+        if lost["unconnected"]:
+            why = "Fawkes asks for the tag where no connection leads"
+            context.fill("nodes: !unconnected", f"{lost['unconnected']} nodes", why)
+        edges = [e for e in self.net.edges if NAME not in e.properties]
+        unnamed = sum(e.id != f"{self.net.nodes[e.source].id}_{self.net.nodes[e.target].id}" for e in edges)
+        context.drop("ids of edges", unnamed, "a connection has no name; its ends say which one it is")
+        context.drop("edges with attributes (action, speed limit …)", lost["edge attributes"], "connections have none")
+        context.drop("edges' bends between their nodes", self.net.bends, "connections are straight")
+        context.drop("parallel edges", lost["parallel"], "Fawkes refuses a second connection of the same nodes")
+        context.drop("attributes of nodes that are no scalars", lost["node attributes"], "Fawkes' properties are texts")
+        context.drop("tilts of nodes", lost["tilted"], "an orientation is one angle")
+        context.drop("intersection tags", lost["one-way modes"], "the connection is one-way now and has one tag only")
+        lost["dangling"] += len(self.document.get("dangling") or ())
+        context.drop("connections to nowhere", lost["dangling"], "Fawkes refuses a graph with one")
+
+
+def _tag(rest: Mapping[str, Any]) -> str | None:
+    """The tag that an item's source gave it, where it can be written."""
+    said = rest.get("tag")
+    return said if isinstance(said, str) and _WORD.match(said) else None
+
+
+def _reach(start: int, onward: Mapping[int, Sequence[int]], seen: set[int]) -> bool:
+    """Add all that can be reached from a node; False where it had been seen already."""
+    if start in seen:
+        return False
+    seen.add(start)
+    front = [start]
+    while front:
+        for k in onward.get(front.pop(), ()):
+            if k not in seen:
+                seen.add(k)
+                front.append(k)
+    return True
+
+
+def _listed(properties: Mapping[str, Any], words: Any, column: int) -> str:
+    """A mapping as a list of one-key mappings, sorted, and bare words where the value still is true."""
+    bare = frozenset(words) if isinstance(words, list) else frozenset()
+    pad = " " * column
+    out = []
+    for key in sorted(properties):
+        if key in bare and properties[key] is True:
+            out.append(f"{pad}- {_yaml.text(key)}\n")
+        else:
+            out.append(f"{pad}- {_yaml.mapping({key: properties[key]}, column + 2)[column + 2 :]}")
+    return "".join(out)
+
+
+# --- the format ------------------------------------------------------------------------------------------------------
+
+_OWN = re.compile(rb"(?m)^graph-name[ \t]*:")
+_TAG = re.compile(rb"(?m)^%TAG\s+\S+\s+tag:fawkesrobotics\.org,navgraph/")
+
+
+def detect(name: str, data: bytes) -> bool:
+    """YAML with Fawkes' tags announced on top, or with the name of a graph."""
+    if not name.lower().endswith((".yaml", ".yml")) or b"nodes" not in data:
+        return False
+    return bool(_TAG.search(data[:4096]) or _OWN.search(data))
+
+
+register(
+    Format(
+        name=NAME,
+        title="Navigation graph (Fawkes)",
+        files=("navgraph.yaml",),
+        media_types=("application/yaml",),
+        carries=frozenset({"topology"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        family=NAME,
+        rank=35,
+        extensions=(".yaml", ".yml"),
+    )
+)
