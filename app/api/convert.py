@@ -20,7 +20,7 @@ from app.api.problems import UnsupportedMedia
 from app.api.schemas import DatumBody, told
 from app.api.services import Here, Services
 from app.api.uploads import Form
-from app.api.versions import check_names, truth
+from app.api.versions import check_names, format_named, truth
 from app.bundle import DRAWN_LAYERS, Hints
 from app.convert import Converted
 from app.convert.make import media_type, zipped
@@ -87,23 +87,26 @@ async def convert(request: Request, here: Here, _: Editor) -> Response:
 
 def _convert(here: Services, form: Form) -> Response:
     fields = dict(form.fields)
-    to = fields.pop("to", "")
-    if not to:
+    to = format_named(fields.pop("to", ""), "to")
+    if to is None:
         raise Invalid("say in the field 'to' which format is wanted", [Problem("missing", where="to")])
     known = formats.get_format(to)
     check_names(form.files)
     layer = fields.pop("layer", "") or None
     if layer is not None and layer not in DRAWN_LAYERS:
         raise Invalid(f"layer must be one of {', '.join(DRAWN_LAYERS)}", [Problem("unknown", where="layer")])
-    source = fields.pop("format", "") or None
-    if source is not None:
-        formats.get_format(source)
+    source = format_named(fields.pop("format", ""), "format")
     level = fields.pop("level", "") or GROUND
     Level(level)
     datum = _datum(fields.pop("datum", ""))
     only_report = truth(fields.pop("report", ""), "report")
     grid = fields.pop("grid", "") or None
     written = {p["name"] for p in parameters.describe(known.write_options)}
+    read = {p["name"] for f in formats.all_formats().values() if f.read for p in parameters.describe(f.read_options)}
+    for name in fields.keys() - written - read:
+        accepted = ", ".join(sorted(written)) or "none"
+        detail = f"{to} has no parameter {name[:80]!r}; accepted: {accepted}"
+        raise Invalid(detail, [Problem(f"unknown; accepted: {accepted}", where=name[:80])])
     hints = Hints(source, layer, level, grid, {k: v for k, v in fields.items() if k not in written})
     values = {k: v for k, v in fields.items() if k in written}
     done = here.maps.convert({f.name: f.path for f in form.files}, to, hints=hints, datum=datum, options=values)

@@ -39,9 +39,10 @@ def options(known: Format) -> list[dict[str, Any]]:
 
 
 def _information(known: Format, layer: Any) -> str:
-    if layer in known.carries:
+    told = known.carries - ({"occupancy"} if known.outlines else frozenset())  # where a grid lies is no grid
+    if layer in told:
         return "raw"
-    return "derived" if derive.plan(frozenset(known.carries), frozenset({layer})) is not None else "-"
+    return "derived" if derive.plan(told, frozenset({layer})) is not None else "-"
 
 
 @router.get("", responses=told(list[FormatOut]), summary="All formats")

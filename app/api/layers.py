@@ -29,11 +29,11 @@ from app.api.services import Here, Services
 from app.errors import Ambiguous, Invalid, MissingDatum, NotFound, Problem
 from app.formats import WriteContext
 from app.model.features import Features
-from app.model.frame import MAX_METRES, Anchor
+from app.model.frame import GROUND, MAX_METRES, Anchor
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
 from app.model.imagery import Picture
-from app.model.layers import MAP, VECTOR_LAYERS, Layer, Layers, PartKey
+from app.model.layers import MAP, SITE, VECTOR_LAYERS, Layer, Layers, PartKey
 from app.model.voxels import DEPTH, VoxelMap
 from app.store.values import Box, PartEntry, Version
 
@@ -167,16 +167,24 @@ def _vector(
     parts = [(key, here.store.features(version, key, bbox=box, crs=crs)) for key in keys]
     if frame is None and any(len(part) and bool((part.local != (crs == "local")).any()) for _, part in parts):
         raise _no_datum(version.environment)
-    collection = feature_collection(parts, crs, frame, version)
+    fences = [e for e in version.parts if e.key.layer == "location" and e.count]
+    alone = layer == "location" and not fences and (box is None or _datum_within(version, box, crs))
+    collection = feature_collection(parts, crs, frame, version, with_datum=alone)
     return Response(collection, media_type=GEOJSON)
 
 
 def feature_collection(
-    parts: Sequence[tuple[PartKey, Features]], crs: Anchor, frame: LocalFrame | None, version: Version
+    parts: Sequence[tuple[PartKey, Features]],
+    crs: Anchor,
+    frame: LocalFrame | None,
+    version: Version,
+    *,
+    with_datum: bool,
 ) -> bytes:
     """GeoJSON (wgs84) or JSON-FG (local) of some parts; each feature says its level and its part's name.
 
-    Coordinates are rounded to 1e-12 degrees and 1e-9 metres.
+    Coordinates are rounded to 1e-12 degrees and 1e-9 metres. with_datum: the datum as a point of its own, for an
+    environment that has one and no fence to tell it.
     """
     features: list[dict[str, Any]] = []
     local = crs == "local"
@@ -194,22 +202,27 @@ def feature_collection(
                 properties = {**properties, "datum": datum}  # noqa: PLW2901
             feature |= {"properties": properties, "level": key.level, "part": key.name}
             features.append(feature)
-    if not features and datum is not None and _is_location(parts, version):
-        point = [0.0, 0.0] if local else [datum["longitude"], datum["latitude"]]
-        shape = {"type": "Point", "coordinates": point}
+    if with_datum and datum is not None:
+        place = [0.0, 0.0] if local else [datum["longitude"], datum["latitude"]]
+        shape = {"type": "Point", "coordinates": place}
         placed = {"geometry": None, "place": shape} if local else {"geometry": shape}
         properties = {"kind": "datum", "datum": datum}
-        features.append({"type": "Feature", "id": "datum", **placed, "properties": properties, "level": "ground"})
+        features.append(
+            {"type": "Feature", "id": "datum", **placed, "properties": properties, "level": GROUND, "part": SITE}
+        )
     out: dict[str, Any] = {"type": "FeatureCollection"}
     if local:
         out |= {"conformsTo": CONFORMS, "coordRefSys": LOCAL_CRS, "datum": datum}
     return json_bytes({**out, "features": features})
 
 
-def _is_location(parts: Sequence[tuple[PartKey, Features]], version: Version) -> bool:
-    return all(key.layer == "location" for key, _ in parts) and bool(
-        parts or not any(e.key.layer == "location" for e in version.parts)
-    )
+def _datum_within(version: Version, box: Box, crs: Anchor) -> bool:
+    """Whether the local origin lies in a box."""
+    if version.datum is None:
+        return False
+    x, y = (0.0, 0.0) if crs == "local" else (version.datum.longitude, version.datum.latitude)
+    across = box[0] <= x <= box[2] if box[0] <= box[2] else x >= box[0] or x <= box[2]
+    return across and box[1] <= y <= box[3]
 
 
 def geojson_of(geometry: NDArray[np.object_], digits: int) -> list[orjson.Fragment | None]:

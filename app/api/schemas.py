@@ -5,11 +5,11 @@ The examples fit each other: a test runs every one of them against a server that
 
 from __future__ import annotations
 
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 from fastapi import Header, Path, Query
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from app.api.problems import MEDIA_TYPE
 from app.model.frame import MAX_DATUM_LATITUDE
@@ -27,6 +27,18 @@ class In(BaseModel):
     """A request body: unknown members and numbers that are not finite are refused."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+def _representable(moment: datetime) -> datetime:
+    """Times near the years 1 and 9999 leave the calendar in another zone, UTC for instance."""
+    try:
+        moment.astimezone(UTC)
+    except OverflowError:
+        raise ValueError("this time is outside the calendar: give one between the years 2 and 9998") from None
+    return moment
+
+
+Moment = Annotated[datetime, AfterValidator(_representable)]
 
 
 class DatumBody(In):
@@ -187,7 +199,7 @@ class ChannelBody(In):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, json_schema_extra={"examples": [{"version": 1}]})
 
     version: int | str = Field(description="Number, channel or `latest`; kept as the number.")
-    activate_at: datetime | None = Field(
+    activate_at: Moment | None = Field(
         None, description="RFC 3339 time with zone at which the channel moves; left out: now."
     )
 
@@ -209,7 +221,7 @@ class TokenBody(In):
         None, min_length=1, max_length=200, description="Name pattern (`farm-*`) of the environments it reaches."
     )
     robot: str | None = Field(None, min_length=1, max_length=200, description="The robot whose status it may set.")
-    expires: datetime | None = Field(None, description="RFC 3339 time with zone; left out: never.")
+    expires: Moment | None = Field(None, description="RFC 3339 time with zone; left out: never.")
 
 
 # --- answers ---
@@ -315,6 +327,7 @@ class ReportOut(BaseModel):
     format: str
     version: int
     layers: list[dict[str, Any]]
+    attribution: list[str] = Field(description="Licences and credits of the sources, to be shown with the map.")
     template: list[dict[str, Any]]
     dropped: list[dict[str, Any]]
     warnings: list[ProblemItem]

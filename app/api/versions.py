@@ -10,6 +10,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
+from app import formats
 from app.api.access import Editor, Principal, Viewer
 from app.api.answers import Route, answer, page, path_of
 from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
@@ -278,7 +279,7 @@ def _upload(form: Form, request: Request) -> Upload:
     message = fields.pop("message", "")
     return Upload(
         files=tuple(form.files),
-        format=fields.pop("format", "") or None,
+        format=format_named(fields.pop("format", ""), "format"),
         layer=layer,
         level=level,
         grid=fields.pop("grid", "") or None,
@@ -287,6 +288,16 @@ def _upload(form: Form, request: Request) -> Upload:
         dry_run=truth(fields.pop("dry_run", ""), "dry_run"),
         options=fields,
     )
+
+
+def format_named(text: str, where: str) -> str | None:
+    """A format's id as a form says it; empty is none. Invalid, with those there are, where it is not known."""
+    if not text:
+        return None
+    try:
+        return formats.get_format(text).name
+    except NotFound as error:
+        raise Invalid(error.detail, [Problem("no such format", where=where)]) from None
 
 
 def check_names(files: list[SpooledFile]) -> None:

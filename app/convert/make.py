@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import mimetypes
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,6 +14,7 @@ from app.convert.recipe import Chain
 from app.errors import FleetMapError, Problem
 from app.formats import Format, WriteContext, _archive
 from app.model.features import Features
+from app.model.frame import GROUND
 from app.model.layers import LAYERS, VECTOR_LAYERS, Layers, PartKey
 from app.store import Store
 from app.store.values import PartEntry, Version
@@ -68,9 +69,11 @@ def write(
     used = Layers({k: p for k, p in made.parts.items() if k.layer in known.carries}, made.datum, made.levels)
     context = WriteContext(options=formats.write_options(known, values))
     files = formats.write(known, used, context)
+    lines = _told(used, layers, way, entries or {}, origin or {})
     report = {
         "format": known.name,
-        "layers": _told(used, layers, way, entries or {}, origin or {}),
+        "layers": lines,
+        "attribution": credits_of(lines),
         "template": context.template,
         # What a stored version holds beside this map is not part of the recipe's key: ``Maps.report`` adds it.
         "dropped": context.dropped + (not_carried(known, None, layers) if entries is None else []),
@@ -112,16 +115,35 @@ def _told(
             step = steps[key.layer]
             sources = sorted({s for k, e in entries.items() if k.layer in step.needs for s in e.provenance.sources})
             sources = sources or sorted({s for k, (n, _) in origin.items() if k.layer in step.needs for s in n})
-            line |= {"information": "derived", "steps": [step.name], "sources": sources}
+            needed = [k for k in before.parts if k.layer in step.needs]
+            credit = list(dict.fromkeys(text for k in needed for text in _credit(k, before, entries)))
+            line |= {"information": "derived", "steps": [step.name], "sources": sources, "attribution": credit}
         elif key in entries:
             p = entries[key].provenance
             line |= {"information": p.information, "steps": [dict(s) for s in p.steps], "sources": list(p.sources)}
+            line["attribution"] = _credit(key, before, entries)
         else:
             line |= {"information": "raw", "steps": [], "sources": list(origin.get(key, ((), ""))[0])}
+            line["attribution"] = _credit(key, before, entries)
         out.append(line)
     if used.datum is not None and not any(line["layer"] == "location" for line in out):
-        out.insert(0, {"layer": "location", "information": "raw", "steps": [], "sources": [], "name": "datum"})
+        site = {"layer": "location", "level": GROUND, "name": "datum", "information": "raw"}
+        out.insert(0, {**site, "steps": [], "sources": [], "attribution": []})
     return out
+
+
+def _credit(key: PartKey, layers: Layers, entries: Mapping[PartKey, PartEntry]) -> list[str]:
+    """Licences and credits of a part: what the version notes of its sources, else what the part itself says."""
+    if key in entries:
+        return list(entries[key].provenance.attribution)
+    part = layers.parts.get(key)
+    said = part.document.get("attribution", ()) if isinstance(part, Features) else ()
+    return [str(text) for text in said]
+
+
+def credits_of(lines: Iterable[Mapping[str, Any]]) -> list[str]:
+    """The licences and credits of all layers of a report, each once."""
+    return list(dict.fromkeys(text for line in lines for text in line.get("attribution", ())))
 
 
 def not_carried(known: Format, entries: Mapping[PartKey, PartEntry] | None, layers: Layers) -> list[dict[str, Any]]:

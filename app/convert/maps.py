@@ -74,11 +74,17 @@ class Maps:
             # Equal content may have come from other files in another version: sources are this version's own.
             known = entries.get((line["layer"], line.get("level"), line["name"]))
             if known is not None:
-                line = {**line, "information": known.information, "sources": list(known.sources)}  # noqa: PLW2901
+                line = {  # noqa: PLW2901
+                    **line,
+                    "information": known.information,
+                    "sources": list(known.sources),
+                    "attribution": list(known.attribution),
+                }
             lines.append(line)
         stored = {e.key: e for e in recipe.version.parts}
         dropped = told["dropped"] + making.not_carried(recipe.format, stored, Layers())
-        return {**told, "version": recipe.version.number, "layers": lines, "dropped": dropped}
+        version, credit = recipe.version.number, making.credits_of(lines)
+        return {**told, "version": version, "layers": lines, "attribution": credit, "dropped": dropped}
 
     def coverage(self, version: Version) -> list[dict[str, Any]]:
         """For every format that can be served: direct, derivable or missing, by which chain, and what to supply."""

@@ -1,4 +1,9 @@
-"""The contract's edits (put, delete, cells) -> changes of the store, checked against the version they build on."""
+"""The contract's edits (put, delete, cells) -> changes of the store, checked against the version they build on.
+
+A feature may be put back as ``GET …/layers/{layer}`` shows it: what was not edited in it stays exactly as it is stored,
+also where the answer rounded or converted it. A feature that is edited keeps its anchor, whatever ``crs`` its new place
+is told in.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +16,30 @@ import numpy as np
 import shapely
 import shapely.geometry
 
+from app import formats
 from app.errors import Invalid, MissingDatum, NotFound, Problem
+from app.ingest.prepare import moved
 from app.model.features import NO_GEOMETRY, Features, Properties
-from app.model.frame import GROUND
+from app.model.frame import GROUND, Datum
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import NETWORK, SITE, VECTOR_LAYERS, ZONES, Layer, PartKey
 from app.store import Store
-from app.store.changes import Changes, Delete, Provenance, Put, Replace
+from app.store.changes import KEEP, Changes, Delete, Provenance, Put, Replace
 from app.store.values import Version
 
 EDITED = Provenance("raw", "edit")
+
+SAME_METRES, SAME_DEGREES = 2e-9, 2e-12
+"""Twice what an answer rounds coordinates to: a place that differs by less was not edited."""
+
+_SHAPES: Mapping[str, frozenset[str]] = {
+    "node": frozenset({"Point"}),
+    "edge": frozenset({"LineString"}),
+    "location": frozenset({"Polygon", "MultiPolygon"}),
+    "zones": frozenset({"Polygon", "MultiPolygon"}),
+}
+"""Which geometries each item may have; objects may have any."""
 
 _USUAL_NAME: Mapping[str, str] = {"topology": NETWORK, "location": SITE, "zones": ZONES, "objects": "edit"}
 
@@ -33,18 +51,28 @@ class _Draft:
     stored: Features | None
     puts: dict[str, tuple[Any, Properties, bool]] = field(default_factory=dict)
     deletes: set[str] = field(default_factory=set)
+    place: Mapping[str, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.place = {} if self.stored is None else {item: k for k, item in enumerate(self.stored.ids)}
 
     def holds(self, item: str) -> bool:
         if item in self.puts:
             return True
-        return item not in self.deletes and self.stored is not None and item in set(self.stored.ids)
+        return item not in self.deletes and item in self.place
 
     def row(self, item: str) -> tuple[Any, Properties, bool]:
-        if item in self.puts:
-            return self.puts[item]
+        return self.puts[item] if item in self.puts else self.before(item)
+
+    def before(self, item: str) -> tuple[Any, Properties, bool]:
+        """The item as it is stored."""
         assert self.stored is not None
-        k = self.stored.ids.index(item)
+        k = self.place[item]
         return self.stored.geometry[k], self.stored.properties[k], bool(self.stored.local[k])
+
+    def edited(self) -> set[str]:
+        """The stored items that go, or become something else."""
+        return self.deletes | {i for i, new in self.puts.items() if i in self.place and not _equal(self.before(i), new)}
 
 
 def edit_changes(
@@ -63,7 +91,9 @@ def edit_changes(
     problems += session.dangling()
     if problems:
         raise Invalid("; ".join(p.problem for p in problems), problems)
-    return session.changes(), ()
+    session.loosen()
+    wanted = session.changes()
+    return wanted, tuple(moved(base, wanted.datum)) if isinstance(wanted.datum, Datum) else ()
 
 
 class _Session:
@@ -73,6 +103,7 @@ class _Session:
         self._drafts: dict[PartKey, _Draft] = {}
         self._grids: dict[PartKey, OccupancyGrid] = {}
         self._keys = {e.key for e in base.parts}
+        self._datum = base.datum
 
     def apply(self, change: Mapping[str, Any]) -> None:
         """One edit of the contract: op put, delete or cells."""
@@ -112,6 +143,32 @@ class _Session:
                         out.append(Problem(reason, where=item))
         return out
 
+    def loosen(self) -> None:
+        """Cut the tie of network items to a drawn line where either of them was edited.
+
+        Drawing formats write the line and leave out what was made from it; that holds only while both say the same.
+        """
+        families = {f.family for f in formats.all_formats().values() if f.drawing}
+        touched: dict[str, set[str]] = defaultdict(set)
+        for key, draft in list(self._drafts.items()):
+            if key.layer == "objects" and key.name in families:
+                touched[key.level] |= draft.edited()
+            elif key.layer == "topology" and draft.stored is not None:
+                where = {i: k for k, i in enumerate(draft.stored.ids)}
+                sources = {draft.stored.properties[where[i]].get("drawn_from") for i in draft.edited() if i in where}
+                touched[key.level] |= {s for s in sources if isinstance(s, str)}
+        for key in sorted(self._keys):
+            if key.layer != "topology" or not touched[key.level]:
+                continue
+            draft = self._draft(key)
+            for item in draft.stored.ids if draft.stored is not None else ():
+                if item in draft.deletes:
+                    continue
+                geometry, properties, local = draft.row(item)
+                if properties.get("drawn_from") in touched[key.level]:
+                    kept = {name: value for name, value in properties.items() if name != "drawn_from"}
+                    draft.puts[item] = (geometry, kept, local)
+
     def changes(self) -> Changes:
         """What the store is asked to do."""
         operations: list[Put | Delete | Replace] = []
@@ -127,7 +184,7 @@ class _Session:
                 operations.append(Put(key, Features(ids, geometry, properties, local), self._provenance(key)))
         for key, grid in sorted(self._grids.items()):
             operations.append(Replace(key, grid, self._provenance(key)))
-        return Changes(tuple(operations))
+        return Changes(tuple(operations), KEEP if self._datum == self._base.datum else self._datum)
 
     def _provenance(self, key: PartKey) -> Provenance:
         """An edited part stays what it was made of: raw, derived …"""
@@ -156,20 +213,52 @@ class _Session:
         properties = feature.get("properties") or {}
         if not isinstance(properties, Mapping):
             raise Invalid("the feature's 'properties' must be an object")
+        if layer == "location":
+            properties = self._take_datum(properties)
+            if properties.get("kind") == "datum":
+                return
         key = self._key_of(layer, item, change)
         draft = self._draft(key)
         geometry, local = self._geometry(feature, change)
+        what: str = layer
         if layer == "topology":
             properties = _network_item(item, properties)
-            if geometry is None and properties["kind"] == "edge":
+            what = str(properties["kind"])
+            if geometry is None and what == "edge":
                 geometry, local = self._straight(draft, properties)
+        before = draft.row(item) if draft.holds(item) else None
         if geometry is None:
             geometry = NO_GEOMETRY
-        before = draft.row(item) if draft.holds(item) else None
+        elif before is not None:
+            geometry, local = self._as_before(before, geometry, local)
+        if before is None or geometry is not before[0]:
+            _check_shape(what, item, geometry)
         draft.deletes.discard(item)
         draft.puts[item] = (geometry, dict(properties), local)
         if layer == "topology" and properties["kind"] == "node" and before is not None:
             self._drag_edges(draft, item, before, (geometry, local))
+
+    def _take_datum(self, properties: Mapping[str, Any]) -> Mapping[str, Any]:
+        """A location's properties without ``datum``, which is the environment's own and not kept twice."""
+        said = properties.get("datum")
+        if said is not None:
+            names = ("latitude", "longitude", "altitude", "heading")
+            if not isinstance(said, Mapping) or not {"latitude", "longitude"} <= set(said) <= set(names):
+                raise Invalid('properties.datum must be {"latitude": …, "longitude": …, "altitude"?, "heading"?}')
+            self._datum = Datum(**said)
+        return {name: value for name, value in properties.items() if name != "datum"}
+
+    def _as_before(self, before: tuple[Any, Properties, bool], geometry: Any, local: bool) -> tuple[Any, bool]:
+        """A stored item's new place in the item's own anchor; the stored one where it was not moved."""
+        stored, _, anchored = before
+        if stored.is_empty:
+            return geometry, local
+        if anchored != local and self._frame is None:
+            return geometry, local
+        shown = stored if anchored == local else self._other(stored, anchored)
+        if _near(shown, geometry, SAME_METRES if local else SAME_DEGREES):
+            return stored, anchored
+        return (geometry if anchored == local else self._other(geometry, local)), anchored
 
     def _straight(self, draft: _Draft, properties: Mapping[str, Any]) -> tuple[Any, bool]:
         """An edge without a geometry runs straight from node to node."""
@@ -178,6 +267,8 @@ class _Session:
             if not draft.holds(properties[end]):
                 return NO_GEOMETRY, True  # told as dangling when all edits are known
             ends.append(draft.row(properties[end]))
+            if ends[-1][0].geom_type != "Point" or ends[-1][0].is_empty:
+                raise Invalid(f"{properties[end]!r} is no node with a place: give the edge a geometry, a LineString")
         local = ends[0][2]
         places = [g if there == local else self._other(g, there) for g, _, there in ends]
         return shapely.LineString([shapely.get_coordinates(p, include_z=p.has_z)[0][:2] for p in places]), local
@@ -331,6 +422,30 @@ def _shape(geometry: Any) -> Any:
         return shapely.geometry.shape(geometry)
     except Exception as error:
         raise Invalid(f"not a GeoJSON geometry: {error}") from error
+
+
+def _equal(a: tuple[Any, Properties, bool], b: tuple[Any, Properties, bool]) -> bool:
+    return a[2] == b[2] and a[1] == b[1] and bool(shapely.equals_identical(a[0], b[0]))
+
+
+def _near(a: Any, b: Any, tolerance: float) -> bool:
+    """Whether two geometries are built alike, each coordinate within the tolerance; heights within two nanometres."""
+    if a.geom_type != b.geom_type or a.has_z != b.has_z or not a.equals_exact(b, 0.0 if a.is_empty else tolerance):
+        return False
+    if not a.has_z:
+        return True
+    ours, theirs = (shapely.get_coordinates(g, include_z=True)[:, 2] for g in (a, b))
+    return bool(np.allclose(ours, theirs, rtol=0.0, atol=SAME_METRES, equal_nan=True))
+
+
+def _check_shape(what: str, item: str, geometry: Any) -> None:
+    """Refuse a node that is no point, an edge that is no line, a fence or zone that is no polygon."""
+    allowed = _SHAPES.get(what)
+    if allowed is None or (geometry.geom_type in allowed and not geometry.is_empty):
+        return
+    name = {"location": "fence", "zones": "zone"}.get(what, what)
+    got = "none" if geometry is NO_GEOMETRY else geometry.geom_type
+    raise Invalid(f"{name} {item!r} must have a geometry of type {' or '.join(sorted(allowed))}, got {got}")
 
 
 def _network_item(item: str, properties: Mapping[str, Any]) -> Mapping[str, Any]:

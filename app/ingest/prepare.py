@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ from app.bundle import Bundle, Hints, Known
 from app.errors import Invalid, Problem
 from app.formats import Limits
 from app.ingest.match import match_ids
-from app.model.features import Features
+from app.model.features import Features, merge_documents
 from app.model.frame import Datum
 from app.model.grid import UNKNOWN, OccupancyGrid
 from app.model.layers import Part, PartKey, Resources, join_levels
@@ -127,7 +128,7 @@ def _operation(
         if held and key.layer in ("topology", "objects", "zones"):
             part = match_ids(store, base, key, part)
         if mode == "merge":
-            return Put(key, part, provenance)
+            return Put(key, _joined(store, base, key, part) if held else part, provenance)
     elif mode == "merge" and held:
         old = store.load(base, [key]).parts[key]
         if isinstance(part, OccupancyGrid) and isinstance(old, OccupancyGrid):
@@ -135,6 +136,54 @@ def _operation(
         elif isinstance(part, Resources) and isinstance(old, Resources):
             part = Resources({**old.files, **part.files})
     return Replace(key, part, provenance)
+
+
+def _joined(store: Store, base: Version, key: PartKey, part: Features) -> Features:
+    """An upload to be merged, with a document that says what the stored part's and its own say: credits of both,
+    bounds around both, and the drawings of both with their styles, also where two have one name."""
+    old = store.load(base, [key]).parts[key]
+    assert isinstance(old, Features)
+    for family, said in part.document.items():
+        stored, new = (d.get("documents") if isinstance(d, Mapping) else None for d in (old.document.get(family), said))
+        if isinstance(stored, Mapping) and isinstance(new, Mapping):
+            part = _rename_documents(part, family, _free_names(stored, new))
+    out = merge_documents(old.document, part.document)
+    credit = [*_attribution(old), *_attribution(part)]
+    if credit:
+        out["attribution"] = list(dict.fromkeys(credit))
+    boxes = [box for f in (old, part) if (box := f.document.get("bounds"))]
+    if len(boxes) == 2:
+        (west, south, east, north), (w, s, e, n) = boxes
+        out["bounds"] = [min(west, w), min(south, s), max(east, e), max(north, n)]
+    return part.with_document(out)
+
+
+def _free_names(stored: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, str]:
+    """Other names for the new drawings that are called like a stored one and are not the same."""
+    names: dict[str, str] = {}
+    for name in sorted(new):
+        if name in stored and stored[name] != new[name]:
+            stem, dot, end = name.rpartition(".")
+            stem, end = (stem, dot + end) if stem else (name, "")
+            taken = {*stored, *new, *names.values()}
+            names[name] = next(free for n in count(2) if (free := f"{stem}-{n}{end}") not in taken)
+    return names
+
+
+def _rename_documents(part: Features, family: str, names: Mapping[str, str]) -> Features:
+    if not names:
+        return part
+    said = part.document[family]
+    documents = {names.get(name, name): value for name, value in said["documents"].items()}
+
+    def renamed(properties: Mapping[str, Any]) -> Mapping[str, Any]:
+        own = properties.get(family)
+        if not isinstance(own, Mapping) or own.get("document") not in names:
+            return properties
+        return {**properties, family: {**own, "document": names[own["document"]]}}
+
+    document = {**part.document, family: {**said, "documents": documents}}
+    return replace(part, properties=tuple(renamed(p) for p in part.properties), document=document)
 
 
 def _attribution(part: Part) -> list[str]:

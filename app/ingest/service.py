@@ -26,6 +26,9 @@ from app.store.values import Idempotency, Source, Version
 Run = Callable[..., Any]
 """``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""
 
+UNCHANGED = "="
+"""Before the fingerprint of a request that changed nothing."""
+
 TRIES = 50
 """How often a change without ``If-Match`` is brought onto a head that has moved meanwhile."""
 
@@ -157,14 +160,14 @@ class Ingest:
             base = self._store.version(environment)
             check_if_match(if_match, base)
             target = self._store.version(environment, to)
-            if target.root == base.root:
-                return Outcome("unchanged", base, base.as_dict())
+            same = target.root == base.root
+            noted = Idempotency(key.key, UNCHANGED + key.fingerprint) if same and key is not None else key
             try:
                 text = message or f"Revert to version {to}"
                 made = self._store.revert(
-                    environment, to, author=author, message=text, expected=base.number, idempotency=key
+                    environment, to, author=author, message=text, expected=base.number, idempotency=noted
                 )
-                return Outcome("created", made, made.as_dict())
+                return Outcome("unchanged" if same else "created", made, made.as_dict())
             except StaleParent:
                 if last:
                     raise
@@ -200,7 +203,14 @@ class Ingest:
         key: Idempotency | None,
     ) -> Outcome:
         if not prepared.changed:
-            same = self._store.add_sources(environment, base.number, sources) if sources else base
+            # The key is remembered too: sent again after others have changed the map, this must not undo their work.
+            if key is not None:
+                noted = Idempotency(key.key, UNCHANGED + key.fingerprint)
+                same = self._store.commit(
+                    environment, prepared, author=author, message=message, sources=tuple(sources), idempotency=noted
+                )
+            else:
+                same = self._store.add_sources(environment, base.number, sources) if sources else base
             return Outcome("unchanged", same, {**same.as_dict(), "warnings": [w.as_dict() for w in warnings]})
         made = self._store.commit(
             environment,
@@ -221,10 +231,11 @@ class Ingest:
         if known is None:
             return None
         fingerprint, number = known
-        if fingerprint != key.fingerprint:
+        if fingerprint.removeprefix(UNCHANGED) != key.fingerprint:
             raise Conflict(f"the Idempotency-Key {key.key!r} was used for another request: choose a new one")
         version = self._store.version(environment, number)
-        return Outcome("replayed", version, version.as_dict())
+        same = fingerprint.startswith(UNCHANGED)
+        return Outcome("unchanged" if same else "replayed", version, version.as_dict())
 
     def _keep(self, upload: Upload, proposal: Proposal) -> list[Source]:
         """Store the originals byte for byte, before the version that names them."""

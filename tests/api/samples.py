@@ -89,3 +89,18 @@ KML = b"""\
 <Placemark><name>lane</name><LineString><coordinates>-0.5245,53.2686 -0.5244,53.2686 -0.5244,53.2687</coordinates>
 </LineString></Placemark></Document></kml>
 """
+
+OSM = b"""\
+<osm version="0.6" copyright="Some Mappers" attribution="https://example.org/copyright">
+ <bounds minlat="53.268" minlon="-0.525" maxlat="53.269" maxlon="-0.524"/>
+ <node id="1" lat="53.2682" lon="-0.5248"/><node id="2" lat="53.2684" lon="-0.5246"/>
+ <way id="3"><nd ref="1"/><nd ref="2"/><tag k="highway" v="track"/></way>
+</osm>
+"""
+
+MORE_OSM = b"""\
+<osm version="0.6"><bounds minlat="53.2681" minlon="-0.5249" maxlat="53.27" maxlon="-0.523"/>
+ <node id="4" lat="53.2692" lon="-0.5238"/><node id="5" lat="53.2694" lon="-0.5236"/>
+ <way id="6"><nd ref="4"/><nd ref="5"/><tag k="highway" v="track"/></way>
+</osm>
+"""

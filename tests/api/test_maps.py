@@ -12,6 +12,7 @@ from urllib.parse import quote
 
 import pytest
 import yaml
+from lxml import etree
 
 from tests.api import samples
 from tests.api.conftest import Api, problem, running, settings_for
@@ -215,6 +216,49 @@ def test_derived_only_where_it_is_allowed(api: Api, bare: str) -> None:
     assert [line["information"] for line in report["layers"] if line["layer"] == "topology"] == ["derived"]
     api.problem("GET", f"{base}/maps/tmap2?derive=false", 422)
     api.problem("GET", f"{base}/reports/tmap2?derive=false", 422)
+
+
+def test_credits_stand_in_reports(api: Api, bare: str) -> None:
+    api.upload(bare, {"area.osm": samples.OSM})
+    credit = ["Some Mappers", "https://example.org/copyright"]
+    for name in ("osm", "kml", "tmap2"):
+        report = api.get(f"environments/{bare}/versions/1/reports/{name}").json()
+        assert set(report) == {"format", "version", "layers", "attribution", "template", "dropped", "warnings"}
+        assert report["attribution"] == credit
+        told = {line["layer"]: line["attribution"] for line in report["layers"]}
+        assert told["topology"] == credit
+        assert told["location"] == []
+    files = [("files", ("area.osm", samples.OSM))]
+    told = api("POST", "convert", 200, files=files, data={"to": "tmap2", "report": "true"}).json()
+    assert told["attribution"] == credit
+
+
+def test_merging_keeps_what_both_say_as_a_whole(api: Api, bare: str) -> None:
+    api.upload(bare, {"area.osm": samples.OSM})
+    api.upload(bare, {"more.osm": samples.MORE_OSM}, mode="merge")
+    root = etree.fromstring(api.get(f"/maps/{bare}/osm").content)
+    assert root.get("copyright") == "Some Mappers"
+    assert {way.get("id") for way in root.iter("way")} == {"3", "6"}
+    box = root.find("bounds")
+    assert box is not None
+    assert [float(box.get(side, "nan")) for side in ("minlat", "minlon", "maxlat", "maxlon")] == [
+        53.268, -0.525, 53.27, -0.523,
+    ]  # fmt: skip
+    assert "Some Mappers" in api.get(f"environments/{bare}/versions/2/reports/osm").json()["attribution"]
+
+
+def test_merging_keeps_two_drawings_of_one_name(api: Api, bare: str) -> None:
+    style = '<Style id="s"><LineStyle><color>%s</color></LineStyle></Style>'
+    point = "<styleUrl>#s</styleUrl><Point><coordinates>-0.5,53.2</coordinates></Point>"
+    mark = f"<Placemark><name>%s</name>{point}</Placemark>"
+    text = '<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>%s</name>%s%s</Document></kml>'
+    for name, colour, mode in (("first", "ff0000ff", "replace"), ("second", "ff00ff00", "merge")):
+        api.upload(bare, {"d.kml": (text % (name, style % colour, mark % name)).encode()}, mode=mode)
+    made = api.get(f"/maps/{bare}/kml").text
+    for said in ("first", "second", "ff0000ff", "ff00ff00"):
+        assert f">{said}<" in made
+    again = {"d.kml": (text % ("second", style % "ff00ff00", mark % "second")).encode()}
+    assert api.upload(bare, again, expect=None, mode="merge").status_code in (200, 201)
 
 
 def test_coverage(api: Api, farm: str) -> None:

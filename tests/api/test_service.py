@@ -73,6 +73,7 @@ def test_formats(api: Api) -> None:
     }  # fmt: skip
     assert grid["information"]["occupancy"] == "raw"
     assert grid["information"]["voxels"] == "-"
+    assert known["kml"]["information"]["occupancy"] == "-", "a KML says where a grid lies, not what is in it"
     assert known["kml"]["information"]["topology"] in ("raw", "derived")
     option = next(o for o in grid["options"] if o["name"] == "file_type")
     assert option["schema"]["enum"] == ["pgm", "png"]
@@ -106,9 +107,9 @@ def test_convert(api: Api) -> None:
     ("fields", "status"),
     [
         ({}, 422),
-        ({"to": "nosuch"}, 404),
+        ({"to": "nosuch"}, 422),
         ({"to": "occupancy_grid"}, 422),
-        ({"to": "tmap2", "format": "nosuch"}, 404),
+        ({"to": "tmap2", "format": "nosuch"}, 422),
         ({"to": "tmap2", "colour": "red"}, 422),
         ({"to": "tmap2", "datum": "x"}, 422),
         ({"to": "tmap2", "datum": "99,0"}, 422),

@@ -82,7 +82,7 @@ def test_plain(tight: Api) -> None:
         (FILE + part('form-data; name="mode"', b"sometimes") + END, 422),
         (FILE + part('form-data; name="layer"', b"sky") + END, 422),
         (FILE + part('form-data; name="dry_run"', b"perhaps") + END, 422),
-        (FILE + part('form-data; name="format"', b"word") + END, 404),
+        (FILE + part('form-data; name="format"', b"word") + END, 422),
         (FILE + part('form-data; name="no_such_option"', b"1") + END, 422),
         (FILE + part('form-data; name="message"', b"\xff\xfe") + END, 422),
         (FILE + part('form-data; name="message"', b"x" * 70_000) + END, 413),

@@ -102,6 +102,22 @@ def test_an_answer_that_got_lost(api: Api, bare: str) -> None:
     assert api.get(f"environments/{bare}").json()["version"] == 2
 
 
+def test_a_request_that_changed_nothing_undoes_nothing_when_sent_again(api: Api, bare: str) -> None:
+    api.upload(bare, {"n.tmap2.yaml": samples.tmap2()})
+    headers = {"Idempotency-Key": "k"}
+    api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, expect=200, headers=headers)
+    api.post(f"environments/{bare}/versions", {"revert_to": 1}, expect=200, headers={"Idempotency-Key": "r"})
+    api.upload(bare, {"n.tmap2.yaml": samples.tmap2({"gate": (0.0, 0.0), "barn": (10.0, 1.0), "field": (9.0, 9.0)})})
+    again = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, expect=200, headers=headers)
+    assert again.json()["version"] == 1
+    once_more = {"Idempotency-Key": "r"}
+    assert api.post(f"environments/{bare}/versions", {"revert_to": 1}, expect=200, headers=once_more).json() == (
+        again.json()
+    )
+    problem(api.upload(bare, {"datum.yaml": samples.DATUM}, expect=409, headers=headers))
+    assert api.get(f"environments/{bare}").json()["version"] == 2
+
+
 def test_a_revert_is_a_version(api: Api, farm: str) -> None:
     body = {"revert_to": 1, "message": "the gate was open"}
     answer = api.post(f"environments/{farm}/versions", body, headers={"If-Match": '"3"', "Idempotency-Key": "r"})

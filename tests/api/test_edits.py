@@ -1,0 +1,146 @@
+"""Edits of what the server itself has shown: nothing that was not edited changes, and nothing false is stored."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+from tests.api import samples
+from tests.api.conftest import Api
+
+Json = dict[str, Any]
+
+DRAWING = b"""\
+<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>lanes</name>
+<Placemark><name>lane</name><LineString><coordinates>-0.5245,53.2686 -0.5244,53.2686 -0.5243,53.2687</coordinates>
+</LineString></Placemark>
+<Placemark><name>other</name><LineString><coordinates>-0.5242,53.2686 -0.5241,53.2686</coordinates></LineString>
+</Placemark></Document></kml>
+"""
+
+
+def features(api: Api, env: str, layer: str, **query: str) -> dict[str, Json]:
+    found = api.get(f"environments/{env}/versions/latest/layers/{layer}", params=query).json()["features"]
+    return {f["id"]: f for f in found}
+
+
+def edit(api: Api, env: str, *changes: Json, expect: int = 201) -> Json:
+    body: Json = api.post(f"environments/{env}/edits", {"changes": list(changes)}, expect=expect).json()
+    return body
+
+
+def put(layer: str, feature: Json, **more: object) -> Json:
+    return {"op": "put", "layer": layer, "feature": feature, **more}
+
+
+@pytest.mark.parametrize("layer", ["topology", "location"])
+@pytest.mark.parametrize("crs", ["local", "wgs84"])
+def test_what_is_put_back_as_it_was_shown_changes_nothing(api: Api, bare: str, layer: str, crs: str) -> None:
+    odd = {"a": (1 / 3, 2 / 3), "b": (10 / 7, -5 / 9)}
+    files = {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2(odd, (("a", "b"), ("b", "a")))}
+    before = api.upload(bare, files).json()
+    shown = features(api, bare, layer, crs=crs)
+    assert shown
+    body = edit(api, bare, *(put(layer, f, crs=crs) for f in shown.values()), expect=200)
+    assert (body["version"], body["root"]) == (1, before["root"])
+
+
+def test_an_edited_item_keeps_its_anchor(api: Api, farm: str) -> None:
+    node = features(api, farm, "topology", crs="wgs84")["barn"]
+    node["geometry"]["coordinates"][1] += 1e-5
+    edit(api, farm, put("topology", node, crs="wgs84"))
+    (entry,) = [e for e in api.get(f"environments/{farm}/versions/4/layers").json() if e["layer"] == "topology"]
+    assert entry["bounds"]["wgs84"] is None
+    here = features(api, farm, "topology", crs="local")
+    assert here["barn"]["place"]["coordinates"] == pytest.approx([10.0, 1.113], abs=1e-3)
+    assert here["gate_barn"]["place"]["coordinates"][-1] == here["barn"]["place"]["coordinates"]
+
+
+def test_the_datum_is_edited_with_the_fence(api: Api, farm: str) -> None:
+    (fence,) = features(api, farm, "location").values()
+    fence["properties"]["datum"]["latitude"] += 0.001
+    body = edit(api, farm, put("location", fence))
+    assert set(body["changes"]) == {"datum"}
+    assert "local items keep their metres" in body["warnings"][0]["problem"]
+    assert api.get(f"environments/{farm}").json()["datum"]["latitude"] == pytest.approx(samples.LATITUDE + 0.001)
+    (after,) = features(api, farm, "location").values()
+    assert after["geometry"] == fence["geometry"]
+    fence["properties"]["datum"] = {"latitude": "north", "longitude": 0}
+    edit(api, farm, put("location", fence), expect=422)
+
+
+def test_a_datum_without_a_fence(api: Api, bare: str) -> None:
+    api("PATCH", f"environments/{bare}", 200, json={"datum": {"latitude": 1.0, "longitude": 2.0}})
+    (point,) = features(api, bare, "location").values()
+    assert (point["id"], point["part"], point["geometry"]["coordinates"]) == ("datum", "site", [2.0, 1.0])
+    for layer in ("objects", "topology", "zones"):
+        assert features(api, bare, layer) == {}
+    assert features(api, bare, "location", bbox="10,10,11,11") == {}
+    assert set(features(api, bare, "location", bbox="1,0,3,2")) == {"datum"}
+    point["properties"]["datum"]["heading"] = 30.0
+    body = edit(api, bare, put("location", point))
+    assert set(body["changes"]) == {"datum"}
+    assert api.get(f"environments/{bare}").json()["datum"]["heading"] == 30.0
+    assert not [e for e in api.get(f"environments/{bare}/versions/latest/layers").json() if e["count"]]
+
+
+POINT: Json = {"type": "Point", "coordinates": [0.0, 0.0]}
+RING: Json = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]]]}
+
+
+@pytest.mark.parametrize(
+    ("layer", "geometry", "properties", "said"),
+    [
+        ("topology", None, {"kind": "node"}, "Point"),
+        ("topology", RING, {"kind": "node"}, "Point"),
+        ("topology", POINT, {"kind": "edge", "source": "gate", "target": "barn"}, "LineString"),
+        ("zones", POINT, {"kind": "keepout"}, "Polygon"),
+        ("zones", None, {"kind": "keepout"}, "Polygon"),
+        ("location", POINT, {"kind": "fence"}, "Polygon"),
+    ],
+)
+def test_items_have_the_geometry_of_their_kind(
+    api: Api, farm: str, layer: str, geometry: Json | None, properties: Json, said: str
+) -> None:
+    feature = {"type": "Feature", "id": "new", "geometry": geometry, "properties": properties}
+    change = put(layer, feature, crs="local")
+    found = api.problem("POST", f"environments/{farm}/edits", 422, json={"changes": [change]})
+    assert said in found["detail"]
+    assert found["errors"][0]["where"] == "changes[0]"
+
+
+def placemarks(api: Api, env: str) -> list[str]:
+    text = api.get(f"/maps/{env}/kml").text
+    return re.findall(r"<Placemark[^>]*>\s*<name>([^<]*)</name>", text)
+
+
+def test_an_edited_network_is_not_hidden_behind_its_drawing(api: Api, bare: str) -> None:
+    """A drawing format leaves out what was made from a line it writes: only as long as that line still tells it."""
+    api.upload(bare, {"lanes.kml": DRAWING}, layer="topology")
+    assert set(placemarks(api, bare)) == {"lane", "other"}
+    network = features(api, bare, "topology")
+    node = next(f for i, f in network.items() if f["geometry"]["coordinates"] == [-0.5244, 53.2686])
+    assert node["properties"]["drawn_from"] == "lane"
+    node["geometry"]["coordinates"][1] += 1e-4
+    edit(api, bare, put("topology", node))
+    told = placemarks(api, bare)
+    assert node["id"] in told
+    assert {"lane", "other"} <= set(told)
+    of_other = [i for i, f in network.items() if f["properties"]["drawn_from"] == "other"]
+    assert of_other
+    assert not set(of_other) & set(told)
+    after = features(api, bare, "topology")
+    assert {i for i, f in after.items() if "drawn_from" in f["properties"]} == set(of_other)
+
+
+def test_a_moved_line_does_not_move_the_network(api: Api, bare: str) -> None:
+    api.upload(bare, {"lanes.kml": DRAWING}, layer="topology")
+    before = features(api, bare, "topology")
+    line = features(api, bare, "objects")["other"]
+    line["geometry"]["coordinates"][0][1] += 1e-4
+    edit(api, bare, put("objects", line))
+    after = features(api, bare, "topology")
+    assert {i: f["geometry"] for i, f in after.items()} == {i: f["geometry"] for i, f in before.items()}
+    assert {"other/0", "other/1"} <= set(before) & set(placemarks(api, bare))
