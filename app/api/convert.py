@@ -25,6 +25,7 @@ from app.bundle import DRAWN_LAYERS, Hints
 from app.convert import Converted
 from app.convert.make import media_type, zipped
 from app.errors import Invalid, Problem
+from app.ingest.service import check_grid_name
 from app.model.frame import GROUND, Datum, Level
 
 router = APIRouter(tags=["formats"], route_class=Route)
@@ -101,6 +102,7 @@ def _convert(here: Services, form: Form) -> Response:
     datum = _datum(fields.pop("datum", ""))
     only_report = truth(fields.pop("report", ""), "report")
     grid = fields.pop("grid", "") or None
+    check_grid_name(grid)
     written = {p["name"] for p in parameters.describe(known.write_options)}
     read = {p["name"] for f in formats.all_formats().values() if f.read for p in parameters.describe(f.read_options)}
     for name in fields.keys() - written - read:

@@ -335,7 +335,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         grid = resampled(grid, options.resolution)
     if options.normalize:
         grid = normalized(grid)
-    stem = re.sub(r"[/\\\x00-\x1f]", "_", key.name).lstrip(".") or MAP
+    # A second character ":" would make a Windows drive of it, which no archive may hold.
+    stem = re.sub(r"[/\\\x00-\x1f]|(?<=^.):", "_", key.name.lstrip(".")) or MAP
     grid, pixels, kind = _encoding(grid, options, context, stem + ".yaml")
     if max(grid.width, grid.height) > NAV2_CELLS:
         reason = f"the grid has {grid.width} × {grid.height} cells; Nav2 takes at most {NAV2_CELLS} each way"

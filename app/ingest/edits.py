@@ -20,7 +20,7 @@ from app import formats
 from app.errors import Invalid, MissingDatum, NotFound, Problem
 from app.ingest.prepare import moved
 from app.model.features import NO_GEOMETRY, Features, Properties
-from app.model.frame import GROUND, Datum
+from app.model.frame import GROUND, MAX_METRES, Datum
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import NETWORK, SITE, VECTOR_LAYERS, ZONES, Layer, PartKey
@@ -363,7 +363,12 @@ class _Session:
         if polygon.geom_type not in ("Polygon", "MultiPolygon") or not polygon.is_valid:
             reason = shapely.is_valid_reason(polygon)
             raise Invalid(f"polygon must be a valid GeoJSON Polygon or MultiPolygon, got {polygon.geom_type}: {reason}")
-        if not self._is_local(change):
+        local = self._is_local(change)
+        bound = np.array([MAX_METRES, MAX_METRES] if local else [180.0, 90.0])
+        if polygon.is_empty or (np.abs(shapely.get_coordinates(polygon)) > bound).any():
+            unit = f"±{MAX_METRES:g} metres" if local else "longitude ±180, latitude ±90 degrees"
+            raise Invalid(f"the polygon must have corners, all of them within {unit}")
+        if not local:
             polygon = self._other(polygon, False)
         mask = cells_within(grid, polygon)
         if not mask.any():

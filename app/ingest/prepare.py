@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import shapely
 
-from app import bundle
+from app import bundle, formats
 from app.bundle import Bundle, Hints, Known
 from app.errors import Invalid, Problem
 from app.formats import Limits
@@ -69,7 +69,7 @@ def prepare_upload(
     files = bundle.unpack(uploaded, limits)
     told = bundle.read(files, hints, Known(base.datum, _fence(store, base)), limits)
     operations = [_operation(store, base, told, key, mode, files) for key in sorted(told.parts)]
-    warnings = list(told.warnings)
+    warnings = [*told.warnings, *_idle(hints, told)]
     datum: Any = KEEP
     if told.datum is not None and told.datum != base.datum:
         datum = told.datum
@@ -83,6 +83,18 @@ def prepare_upload(
     notes += [FileNote(name, "zip", True) for name in uploaded.keys() - files.keys()]
     members = {name: files[name] for name in files.keys() - uploaded.keys()}
     return Proposal(prepared, tuple(sorted(notes, key=lambda n: n.name)), tuple(warnings), members)
+
+
+def _idle(hints: Hints, told: Bundle) -> list[Problem]:
+    """What the sender said and nothing came of, so that a misunderstanding is noticed."""
+    out = []
+    drawings = {f.name for f in formats.all_formats().values() if f.drawing}
+    if hints.layer is not None and not any(use.format in drawings for use in told.files.values()):
+        told_for = ", ".join(sorted(drawings))
+        out.append(Problem(f"it is for drawings ({told_for}), and there is none in the upload", where="layer"))
+    if hints.grid is not None and not any(key.layer == "occupancy" for key in told.parts):
+        out.append(Problem("there is no grid in the upload to be called so", where="grid"))
+    return out
 
 
 def prepare_changes(database_url: str, blob_dir: str, base: Version, changes: Changes) -> Prepared:

@@ -298,6 +298,7 @@ def _check_upload(upload: Upload) -> None:
         raise Invalid(f"mode must be replace or merge, got {upload.mode!r}")
     if upload.format is not None:
         formats.get_format(upload.format)
+    check_grid_name(upload.grid)
     seen: set[str] = set()
     for file in upload.files:
         problem = bad_name(file.name)
@@ -308,6 +309,24 @@ def _check_upload(upload: Upload) -> None:
                 f"the file name {file.name[:200]!r} cannot be used: {problem}", [Problem(problem, file.name[:200])]
             )
         seen.add(file.name)
+
+
+def check_grid_name(grid: str | None) -> None:
+    """Invalid unless a file can be called so: a grid ``keepout`` is served as ``keepout.yaml``."""
+    if grid is None:
+        return
+    problem = bad_name(grid)
+    if problem is None and "/" in grid:
+        problem = "it has a slash"
+    if problem is None and grid.startswith("."):
+        problem = "it starts with a dot"
+    if problem is None and len(grid) > 100:
+        problem = "it has more than 100 characters"
+    if problem:
+        raise Invalid(
+            f"the grid cannot be called {grid[:100]!r}: {problem}, and its files are called like it",
+            [Problem(problem, where="grid")],
+        )
 
 
 def bad_name(name: str) -> str | None:

@@ -252,3 +252,24 @@ def test_damaged_files(api: Api, bare: str, name: str, data: bytes) -> None:
     body = problem(answer)
     assert body["errors"], body
     assert api.get(f"environments/{bare}").json()["version"] == 0
+
+
+@pytest.mark.parametrize("name", ["a/b", "../../x", "..", ".hidden", "C:\\x", "C:x", "a\nb", "x" * 101])
+def test_a_grid_is_called_as_a_file_can_be(api: Api, bare: str, name: str) -> None:
+    found = problem(api.upload(bare, samples.grid(), expect=422, grid=name))
+    assert found["errors"][0]["where"] == "grid"
+    files = [("files", (n, data)) for n, data in samples.grid().items()]
+    api.problem("POST", "convert", 422, files=files, data={"to": "occupancy_grid", "grid": name})
+
+
+def test_a_grid_in_a_file_of_an_odd_name_is_served(api: Api, bare: str) -> None:
+    files = {f"maps/C:{n}" if n.endswith("yaml") else f"maps/{n}": data for n, data in samples.grid().items()}
+    api.upload(bare, files)
+    assert api.get(f"/maps/{bare}/occupancy_grid").status_code == 200
+
+
+def test_what_was_said_in_vain_is_told(api: Api, bare: str) -> None:
+    body = api.upload(bare, {"n.tmap2.yaml": samples.tmap2()}, layer="zones", grid="keepout").json()
+    assert {w["where"] for w in body["warnings"]} == {"layer", "grid"}
+    assert api.upload(bare, samples.grid(), grid="keepout").json()["warnings"] == []
+    assert not [w for w in api.upload(bare, {"d.kml": samples.KML}, layer="zones").json()["warnings"] if "where" in w]
