@@ -111,7 +111,13 @@ class RevertBody(In):
 
 
 class PutChange(In):
-    """Add or replace one feature, by id."""
+    """Add or replace one feature, by id.
+
+    A feature may be put back as `GET …/layers/{layer}` shows it: what was not edited stays exactly as it is stored. A
+    feature that is there already keeps its anchor (local metres, or a place on earth), whatever `crs` its new place is
+    told in; delete it and put it again to anchor it otherwise. A fence's `properties.datum` sets the environment's
+    datum. Edges that end at a node which is moved move along.
+    """
 
     op: Literal["put"]
     layer: Literal["location", "objects", "topology", "zones"]

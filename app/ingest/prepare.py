@@ -17,7 +17,7 @@ from app import bundle, formats
 from app.bundle import Bundle, Hints, Known
 from app.errors import Invalid, Problem
 from app.formats import Limits
-from app.ingest.match import match_ids
+from app.ingest.match import OWN_IDS, match_ids
 from app.model.features import Features, merge_documents
 from app.model.frame import Datum
 from app.model.grid import UNKNOWN, OccupancyGrid
@@ -68,7 +68,9 @@ def prepare_upload(
     uploaded = {name: path.read_bytes() for name, path in paths.items()}
     files = bundle.unpack(uploaded, limits)
     told = bundle.read(files, hints, Known(base.datum, _fence(store, base)), limits)
-    operations = [_operation(store, base, told, key, mode, files) for key in sorted(told.parts)]
+    renamed: dict[str, dict[str, str]] = {}
+    # Sorted, so objects come before the topology that was drawn from them.
+    operations = [_operation(store, base, told, key, mode, files, renamed) for key in sorted(told.parts)]
     warnings = [*told.warnings, *_idle(hints, told)]
     datum: Any = KEEP
     if told.datum is not None and told.datum != base.datum:
@@ -125,8 +127,16 @@ def _fence(store: Store, base: Version) -> shapely.Polygon | None:
 
 
 def _operation(
-    store: Store, base: Version, told: Bundle, key: PartKey, mode: Mode, files: Mapping[str, bytes]
+    store: Store,
+    base: Version,
+    told: Bundle,
+    key: PartKey,
+    mode: Mode,
+    files: Mapping[str, bytes],
+    renamed: dict[str, dict[str, str]],
 ) -> Replace | Put:
+    """What becomes of one part. renamed: by level, objects that took a stored one's id; what was drawn from them
+    follows."""
     part = told.parts[key]
     names, origin = told.origin[key]
     digest = hashlib.sha256()
@@ -137,8 +147,12 @@ def _operation(
     )
     held = any(e.key == key for e in base.parts)
     if isinstance(part, Features):
-        if held and key.layer in ("topology", "objects", "zones"):
-            part = match_ids(store, base, key, part)
+        if key.layer == "topology" and key.level in renamed:
+            part = _drawn_from(part, renamed[key.level])
+        if held and key.layer in ("topology", "objects", "zones") and origin not in OWN_IDS:
+            ids, part = part.ids, match_ids(store, base, key, part)
+            if key.layer == "objects":
+                renamed.setdefault(key.level, {}).update((a, b) for a, b in zip(ids, part.ids, strict=True) if a != b)
         if mode == "merge":
             return Put(key, _joined(store, base, key, part) if held else part, provenance)
     elif mode == "merge" and held:
@@ -148,6 +162,14 @@ def _operation(
         elif isinstance(part, Resources) and isinstance(old, Resources):
             part = Resources({**old.files, **part.files})
     return Replace(key, part, provenance)
+
+
+def _drawn_from(part: Features, renamed: Mapping[str, str]) -> Features:
+    """A network whose drawing has other ids now."""
+    properties = tuple(
+        {**p, "drawn_from": renamed[p["drawn_from"]]} if p.get("drawn_from") in renamed else p for p in part.properties
+    )
+    return replace(part, properties=properties)
 
 
 def _joined(store: Store, base: Version, key: PartKey, part: Features) -> Features:

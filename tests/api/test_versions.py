@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import zipfile
 
 import pytest
+from lxml import etree
 
 from tests.api import samples
 from tests.api.conftest import Api, problem
@@ -57,6 +59,38 @@ def test_several_files_and_folders_are_one_version(api: Api, bare: str) -> None:
         assert api.get(f"environments/{bare}/versions/1/sources/{name}").content == data
     info = body["information"]
     assert (info["location"], info["topology"], info["occupancy"]) == ("raw", "raw", "raw")
+
+
+def lanes(ids: tuple[str, str]) -> bytes:
+    places = [[[-0.5245, 53.2686], [-0.5244, 53.2686]], [[-0.5243, 53.2687], [-0.5242, 53.2688]]]
+    rows = [
+        {"type": "Feature", "id": i, "geometry": {"type": "LineString", "coordinates": p}, "properties": {}}
+        for i, p in zip(ids, places, strict=True)
+    ]
+    return json.dumps({"type": "FeatureCollection", "features": rows}).encode()
+
+
+def test_a_drawing_sent_again_with_other_ids_is_the_same(api: Api, bare: str) -> None:
+    first = api.upload(bare, {"lanes.geojson": lanes(("a", "b"))}, layer="topology").json()
+    again = api.upload(bare, {"lanes.geojson": lanes(("x", "y"))}, layer="topology").json()
+    assert again["changes"].get("objects") is None, again["changes"]
+    url = f"environments/{bare}/versions/latest/layers"
+    objects = {f["id"] for f in api.get(f"{url}/objects").json()["features"]}
+    network = api.get(f"{url}/topology").json()["features"]
+    assert objects == {"a", "b"}
+    assert {f["properties"]["drawn_from"] for f in network} == objects, first["changes"]
+    assert len(json.loads(api.get(f"/maps/{bare}/geojson").content)["features"]) == 2
+
+
+def test_osm_ids_are_never_changed(api: Api, bare: str) -> None:
+    """They are the world's: what comes with other ids is other things, though it lies in the same places."""
+    api.upload(bare, {"a.osm": samples.OSM})
+    other = samples.OSM.replace(b'id="1"', b'id="11"').replace(b'id="2"', b'id="12"').replace(b'id="3"', b'id="13"')
+    other = other.replace(b'ref="1"', b'ref="11"').replace(b'ref="2"', b'ref="12"')
+    api.upload(bare, {"a.osm": other})
+    root = etree.fromstring(api.get(f"/maps/{bare}/osm").content)
+    assert {node.get("id") for node in root.iter("node")} == {"11", "12"}
+    assert [way.get("id") for way in root.iter("way")] == ["13"]
 
 
 def test_a_zip_is_the_same_as_its_files(api: Api, bare: str) -> None:
