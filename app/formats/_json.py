@@ -1,0 +1,45 @@
+"""JSON as plain values within limits: strict UTF-8, finite numbers, no deep nesting."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import orjson
+
+from app.errors import Problem, TooLarge, UnreadableFile
+from app.formats import Limits
+
+MAX_DEPTH = 128
+"""Nested arrays and objects. Real files have about ten; interpreters that recurse fail near a thousand."""
+
+
+def load(data: bytes, limits: Limits) -> Any:
+    """The value of a JSON text; integers beyond 64 bit become floats. Raises UnreadableFile with line, or TooLarge."""
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if len(data) > limits.text_bytes:
+        raise TooLarge(f"the file has {len(data)} bytes; the limit for a text is {limits.text_bytes}")
+    try:
+        top = orjson.loads(data)
+    except orjson.JSONDecodeError as error:
+        reason = f"not JSON: {error.msg}"
+        raise UnreadableFile(reason, [Problem(reason, line=error.lineno)]) from error
+    _check_depth(data)
+    return top
+
+
+def _check_depth(data: bytes) -> None:
+    """Refuse deep nesting of (well-formed) JSON, counting brackets outside of texts."""
+    plain = re.sub(rb"(?s)\\.", b"  ", data) if b"\\" in data else data
+    characters = np.frombuffer(plain, np.uint8)
+    in_text = np.bitwise_xor.accumulate((characters == ord('"')).view(np.uint8))
+    step = np.zeros(256, np.int8)
+    step[[ord("{"), ord("[")]] = 1
+    step[[ord("}"), ord("]")]] = -1
+    steps = step[characters]
+    steps[in_text != 0] = 0
+    steps = steps[steps != 0]
+    if len(steps) and int(np.cumsum(steps, dtype=np.int64).max()) > MAX_DEPTH:
+        reason = f"nested deeper than {MAX_DEPTH}"
+        raise UnreadableFile(reason, [Problem(reason)])

@@ -1,0 +1,536 @@
+"""nav2_route: the graphs of Nav2's route server, GeoJSON by its shape, metres in a robot's frame by its meaning.
+
+A Point is a node {id, frame, metadata, operations}, a LineString or MultiLineString a directed edge {id, startid,
+endid, cost, overridable, metadata, operations} whose shape the server does not look at. Ids are numbers: 32 bit in a
+graph, 16 bit in the server's actions and services. The server tells integers from floats: what it asks for as a float
+must be written as one (``85.0``), else it throws; so a metadata word that it reads so is always served as a float, and
+all others keep the type they came with. Setting a new graph clears the old one before it is loaded: a bad file leaves
+none.
+Source: navigation2, nav2_route/src/plugins/graph_file_loaders/geojson_graph_file_loader.cpp and the edge scorers.
+
+Canonical: an item's id is its number as a text; ``properties.nav2_route`` holds its ``id``, ``properties`` (the
+feature's, less what is canonical), ``members`` (further ones of the feature), ``line`` where an edge is no
+MultiLineString, and ``geometry`` where its shape is none of ours. The metadata words ``abs_speed_limit`` (metres per
+second), ``name``, ``action`` and ``width`` are the canonical ``speed_limit``, ``name`` … The document's ``nav2_route``
+holds the file's ``members``, the ``ignored`` features that are neither node nor edge, and the ``dangling`` edges
+between unknown nodes (an edge with one known end is kept with that node).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import orjson
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _json, register
+from app.formats._network import (
+    AMONG_PARTS,
+    Array,
+    Edge,
+    Net,
+    Node,
+    edge_lines,
+    joined,
+    known_document,
+    node_points,
+    number,
+    own,
+    refuse,
+    some,
+    without_repeats,
+)
+from app.formats._text import METRES
+from app.model.features import Properties, from_columns, unique_ids
+from app.model.layers import NETWORK, Layers, PartKey
+
+NAME = "nav2_route"
+FRAME = "map"
+LINES = ("LineString", "MultiLineString")
+MAX_ID = 2**32 - 1
+MAX_USED_ID = 2**16 - 1
+"""Of ComputeRoute's start and goal, and of the edges that DynamicEdges closes."""
+
+FLOATS = frozenset({"speed_limit", "abs_speed_limit", "penalty", "abs_time_taken"})
+"""Metadata that Nav2's own plugins ask for as floats."""
+
+TEXTS: Mapping[str, str] = {"name": "name", "action": "action"}
+NUMBERS: Mapping[str, str] = {"abs_speed_limit": "speed_limit", "width": "width"}
+LIFTED: Mapping[str, str] = {**TEXTS, **NUMBERS}
+"""Metadata word -> the canonical word, for values that are texts and numbers."""
+
+TRIGGERS = ("NODE", "ON_ENTER", "ON_EXIT")
+CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}
+"""What Nav2's own graphs say, so that QGIS shows their metres; the route server does not look at it."""
+
+CANONICAL_NODE = frozenset({"kind", "name", "action", "speed_limit", "width", NAME}) | AMONG_PARTS
+CANONICAL_EDGE = CANONICAL_NODE | {"source", "target"}
+
+FAR = 16_384.0
+"""Metres. The server keeps coordinates as 32 bit floats: beyond this they step by two millimetres."""
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """The graph as topology, local metres. Raises UnreadableFile naming the feature; TooLarge beyond the limits."""
+    if not context.wants("topology"):
+        return Layers()
+    top = _json.load(files[context.main or next(iter(files))], context.limits)
+    rows = top.get("features") if isinstance(top, dict) else None
+    if not isinstance(top, dict) or not isinstance(rows, list):
+        raise UnreadableFile(
+            "a route graph is one object with an array of features", [Problem("no array", where="features")]
+        )
+    if len(rows) > context.limits.features:
+        raise TooLarge(f"the file has {len(rows)} features; the limit is {context.limits.features}")
+    return _Reader(top, rows, context).layers()
+
+
+class _Reader:
+    def __init__(self, top: dict[str, Any], rows: list[Any], context: ReadContext) -> None:
+        self.top, self.rows, self.context = top, rows, context
+        self.nodes: list[int] = []
+        self.edges: list[int] = []
+        self.ignored: list[Any] = []
+        self.dangling: list[dict[str, Any]] = []
+        self.whole: Counter[str] = Counter()
+        for k, row in enumerate(rows):
+            where = f"features[{k}]"
+            geometry = row.get("geometry") if isinstance(row, dict) else None
+            if not isinstance(row, dict) or not isinstance(geometry, (dict, type(None))):
+                refuse("must be a GeoJSON feature with a geometry", where)
+            kind = geometry.get("type") if geometry else None
+            if kind == "Point":
+                self.nodes.append(k)
+            elif kind in LINES:
+                self.edges.append(k)
+            else:
+                context.warn("is neither a point nor a line: the route server ignores it; it is kept", where=where)
+                self.ignored.append(row)
+        if not self.nodes or not self.edges:
+            what = "point (node)" if not self.nodes else "line (edge)"
+            reason = f"there is no {what}: the route server takes graphs with one node and one edge at least"
+            raise UnreadableFile(reason, [Problem(reason, where="features")])
+
+    def layers(self) -> Layers:
+        numbers = [self.id_of(k) for k in self.nodes]
+        ids = unique_ids(map(str, numbers))
+        if again := without_repeats(list(map(str, numbers))):
+            self.context.warn(f"{len(again)} nodes share an id: {some(again)}; edges go to the last one, as in Nav2")
+        place = {n: k for k, n in enumerate(numbers)}
+        xyz: Array = np.array([self.position(k) for k in self.nodes], np.float64).reshape(-1, 3)
+        properties: list[dict[str, Any]] = [
+            {"kind": "node", "name": str(n), **self.canonical(k, n)} for k, n in zip(self.nodes, numbers, strict=True)
+        ]
+        kept, numbers, sources, targets = self.ends(place, properties)
+        edges = unique_ids(map(str, numbers), set(ids))
+        if again := without_repeats(list(map(str, numbers))):
+            self.context.warn(f"{len(again)} edges share an id: {some(again)}; later ones are served with a new one")
+        lines = edge_lines(xyz, sources, targets)
+        for j, (k, n) in enumerate(zip(kept, numbers, strict=True)):
+            p = {"kind": "edge", "source": ids[sources[j]], "target": ids[targets[j]], **self.canonical(k, n)}
+            lines[j] = self.shape(k, lines[j], p[NAME])
+            properties.append(p)
+        if self.whole["integers"]:
+            self.context.warn(
+                f"{self.whole['integers']} metadata values ({', '.join(sorted(FLOATS))}) are integers, at which Nav2 "
+                "throws; they are served as floats"
+            )
+        document: dict[str, Any] = {"members": {w: v for w, v in self.top.items() if w not in ("type", "features")}}
+        document |= {"ignored": self.ignored} if self.ignored else {}
+        document |= {"dangling": self.dangling} if self.dangling else {}
+        geometry = np.concatenate([node_points(xyz), lines])
+        part = from_columns([*ids, *edges], geometry, properties, "local", {NAME: document})
+        return Layers({PartKey("topology", self.context.level, NETWORK): part})
+
+    def said(self, k: int) -> dict[str, Any]:
+        """The properties of a feature."""
+        said = self.rows[k].get("properties")
+        if not isinstance(said, dict):
+            refuse("needs properties with an id", f"features[{k}]")
+        return said
+
+    def id_of(self, k: int, word: str = "id") -> int:
+        """A node's or edge's number."""
+        value = self.said(k).get(word)
+        if isinstance(value, float) and value.is_integer():
+            value = int(value)
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
+            shown = "is missing" if value is None else f"is {str(value)[:40]!r}"
+            refuse(f"{shown}; it must be a whole number from 0 to {MAX_ID}", f"features[{k}].properties.{word}")
+        return value
+
+    def position(self, k: int) -> tuple[float, float, float]:
+        """x, y, z in metres."""
+        where = f"features[{k}].geometry.coordinates"
+        at = self.rows[k]["geometry"].get("coordinates")
+        if not isinstance(at, list) or len(at) < 2:
+            refuse("a node needs two coordinates [x, y]", where)
+        x, y, z = (number(v, where) for v in [*at[:3], 0.0][:3])
+        frame = self.said(k).get("frame", FRAME)
+        if frame != FRAME:
+            self.context.warn(f"its frame is {str(frame)[:60]!r}: its coordinates are taken as local", where=where)
+        return x, y, z
+
+    def ends(
+        self, place: Mapping[int, int], properties: list[dict[str, Any]]
+    ) -> tuple[list[int], list[int], list[int], list[int]]:
+        """(features of edges between nodes, their numbers, the places of their ends); others are kept with a node."""
+        kept, numbers, sources, targets = [], [], [], []
+        for k in self.edges:
+            n, start, end = self.id_of(k), self.id_of(k, "startid"), self.id_of(k, "endid")
+            a, b = place.get(start), place.get(end)
+            if a is None or b is None:
+                missing = start if a is None else end
+                self.context.warn(
+                    f"the edge {n} begins or ends at {missing}, which is no node: Nav2 refuses such a graph; it is "
+                    "kept, but not served",
+                    where=f"features[{k}]",
+                )
+                said = {w: v for w, v in self.said(k).items() if w not in ("id", "startid", "endid")}
+                edge = {"id": n, "from": start, "to": end, "properties": said}
+                home = next((j for j in (a, b) if j is not None), None)
+                if home is None:
+                    self.dangling.append(edge)
+                else:
+                    properties[home][NAME].setdefault("dangling", []).append(edge)
+                continue
+            if a == b:
+                self.context.warn(f"the edge {n} leads from a node to itself", where=f"features[{k}]")
+            kept.append(k)
+            numbers.append(n)
+            sources.append(a)
+            targets.append(b)
+        return kept, numbers, sources, targets
+
+    def canonical(self, k: int, n: int) -> dict[str, Any]:
+        """The properties of an item that come from its feature."""
+        row = self.rows[k]
+        rest = {w: v for w, v in self.said(k).items() if w not in ("id", "startid", "endid")}
+        out: dict[str, Any] = {}
+        metadata = rest.get("metadata")
+        if isinstance(metadata, dict):
+            self.whole["integers"] += _integers(metadata)
+            out = {LIFTED[w]: v for w, v in metadata.items() if _fits(w, v) and (w, v) != ("name", str(n))}
+            left = {w: v for w, v in metadata.items() if LIFTED.get(w) not in out}
+            rest["metadata"] = left
+            if not left and metadata:
+                del rest["metadata"]
+        self.whole["integers"] += _integers(rest.get("operations"))
+        for reason in _doubts(rest):
+            self.context.warn(reason, where=f"features[{k}].properties")
+        mine: dict[str, Any] = {"id": n}
+        if rest:
+            mine["properties"] = rest
+        members = {w: v for w, v in row.items() if w not in ("type", "properties", "geometry")}
+        if members:
+            mine["members"] = members
+        return {**out, NAME: mine}
+
+    def shape(self, k: int, straight: Any, mine: dict[str, Any]) -> Any:
+        """An edge's line: as drawn where that is one line of its own, else from node to node."""
+        geometry = self.rows[k]["geometry"]
+        parts = geometry.get("coordinates")
+        if geometry["type"] == "LineString":
+            mine["line"] = True
+            parts = [parts]
+        drawn = _line(parts[0]) if isinstance(parts, list) and len(parts) == 1 else None
+        if len(geometry) > 2 or drawn is None:
+            if len(geometry) > 2 or parts not in (None, []):
+                mine["geometry"] = {w: v for w, v in geometry.items() if w != "type"}
+            return straight
+        return straight if drawn == _line(shapely.get_coordinates(straight).tolist()) else shapely.LineString(drawn)
+
+
+def _fits(word: str, value: Any) -> bool:
+    """Whether a metadata word stands for a canonical one, with a value of its type."""
+    if word in TEXTS:
+        return isinstance(value, str) and value != ""
+    return word in NUMBERS and isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _line(said: Any) -> list[tuple[float, ...]] | None:
+    """Two positions or more, two-dimensional where all heights are 0; None where it is no line."""
+    if not isinstance(said, list) or len(said) < 2:
+        return None
+    out: list[tuple[float, ...]] = []
+    for at in said:
+        if not isinstance(at, list) or len(at) not in (2, 3):
+            return None
+        if not all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in at):
+            return None
+        out.append(tuple(map(float, at)))
+    deep = all(len(at) == 3 for at in out) and any(at[2] for at in out)
+    return out if deep else [at[:2] for at in out]
+
+
+def _is_integer(word: str, value: Any) -> bool:
+    return word in FLOATS and isinstance(value, int) and not isinstance(value, bool)
+
+
+def _integers(value: Any) -> int:
+    """How many values that Nav2 wants as floats are integers, at any depth."""
+    if isinstance(value, list):
+        return sum(map(_integers, value))
+    if not isinstance(value, dict):
+        return 0
+    return sum(_is_integer(w, v) + _integers(v) for w, v in value.items())
+
+
+def _floats(value: Any) -> Any:
+    """The same with these values as floats."""
+    if isinstance(value, list):
+        return [_floats(v) for v in value]
+    if not isinstance(value, dict):
+        return value
+    return {w: float(v) if _is_integer(w, v) else _floats(v) for w, v in value.items()}
+
+
+def _doubts(said: Mapping[str, Any]) -> Iterator[str]:
+    """What the route server's loader would throw at in a feature's properties."""
+    metadata, operations = said.get("metadata"), said.get("operations")
+    if "metadata" in said:
+        yield from _metadata_doubts(metadata, "metadata")
+    if isinstance(operations, (dict, list)):
+        for name, one in operations.items() if isinstance(operations, dict) else enumerate(operations):
+            if not isinstance(one, dict) or not isinstance(one.get("type"), str) or one.get("trigger") not in TRIGGERS:
+                yield f"the operation {str(name)[:60]!r} needs a type and a trigger, one of {', '.join(TRIGGERS)}"
+            elif "metadata" in one:
+                yield from _metadata_doubts(one["metadata"], f"the metadata of the operation {str(name)[:60]!r}")
+    elif "operations" in said:
+        yield "operations must be an object of operations"
+    cost = said.get("cost", 0.0)
+    if isinstance(cost, bool) or not isinstance(cost, (int, float)):
+        yield f"cost must be a number, got {str(cost)[:40]!r}"
+    if not isinstance(said.get("overridable", True), bool):
+        yield f"overridable must be true or false, got {str(said['overridable'])[:40]!r}"
+    if not isinstance(said.get("frame", ""), str):
+        yield f"frame must be a text, got {str(said['frame'])[:40]!r}"
+
+
+def _metadata_doubts(value: Any, where: str) -> Iterator[str]:
+    if not isinstance(value, dict):
+        yield f"{where} must be an object"
+        return
+    for word, inner in value.items():
+        if isinstance(inner, dict):
+            yield from _metadata_doubts(inner, f"{where}.{word[:60]}")
+        elif any(v is None or isinstance(v, (dict, list)) for v in (inner if isinstance(inner, list) else [inner])):
+            yield f"{where}.{word[:60]}: Nav2 reads numbers, texts, booleans and lists of these only"
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``graph.geojson``: all networks of the environment as one graph, nodes and then edges by their numbers.
+
+    Numbers of a source come back; any other item gets one that follows from its id alone (unless that is taken), so
+    that it stays the same when others come and go. Wgs84 items are brought to local metres (MissingDatum without a
+    datum). CannotConvert where there is no node or no edge.
+    """
+    return {"graph.geojson": _Writer(layers, context).data()}
+
+
+class _Writer:
+    def __init__(self, layers: Layers, context: WriteContext) -> None:
+        self.context = context
+        self.document = known_document(layers, NAME)
+        self.net: Net = joined(layers, context)
+        if not self.net.nodes or not self.net.edges:
+            what = "no node" if not self.net.nodes else "no edge between its nodes"
+            raise CannotConvert(f"the network has {what}; the route server needs both: supply a network with edges")
+        self.nodes, self.edges = self._numbers()
+        self.lost: Counter[str] = Counter()
+
+    def _numbers(self) -> tuple[list[int], list[int]]:
+        """The numbers of nodes and edges, apart from each other where there are enough."""
+        net, context = self.net, self.context
+        nodes, edges = _own_numbers(net.nodes), _own_numbers(net.edges)
+        own_nodes, own_edges = set(nodes.values()), set(edges.values())
+        apart = len(net.nodes) + len(net.edges) <= MAX_USED_ID // 2
+        nodes = _numbered(net.nodes, nodes, own_nodes | own_edges if apart else own_nodes)
+        edges = _numbered(net.edges, edges, {*own_edges, *nodes.values()} if apart else own_edges)
+        for what, found, use in (("nodes", nodes, "ComputeRoute's goals"), ("edges", edges, "DynamicEdges")):
+            beyond = sum(n > MAX_USED_ID for n in found.values())
+            if beyond:
+                context.warn(f"{beyond} {what} have ids beyond {MAX_USED_ID}, which {use} cannot name")
+        again = sum(_claim(n) not in (None, nodes[k]) for k, n in enumerate(net.nodes))
+        again += sum(_claim(e) not in (None, edges[k]) for k, e in enumerate(net.edges))
+        if again:
+            context.warn(f"{again} numbers stood for several items, which Nav2 would mix up: the others got new ones")
+        return [nodes[k] for k in range(len(nodes))], [edges[k] for k in range(len(edges))]
+
+    def data(self) -> bytes:
+        """The whole text, one line for each feature."""
+        net, context = self.net, self.context
+        at = np.array([(n.x, n.y, 0.0 if n.z is None else n.z) for n in net.nodes], np.float64)
+        if (np.abs(at[:, :2]) > FAR).any():
+            context.warn(f"coordinates beyond {FAR:g} m: the route server keeps them as 32 bit floats, 2 mm apart")
+        places = (np.round(at, METRES) + 0.0).tolist()
+        rows = [
+            self._feature(node, n, {"type": "Point", "coordinates": place if place[2] else place[:2]}, {})
+            for n, node, place in sorted(zip(self.nodes, net.nodes, places, strict=True), key=lambda t: t[0])
+        ]
+        for n, edge in sorted(zip(self.edges, net.edges, strict=True), key=lambda t: t[0]):
+            ends = {"startid": self.nodes[edge.source], "endid": self.nodes[edge.target]}
+            rows.append(self._feature(edge, n, self._shape(edge), ends))
+        self._report()
+        head = {"type": "FeatureCollection", **self._head()}
+        rows += [orjson.dumps(row) for row in self.document.get("ignored") or ()]
+        self.lost["dangling"] += len(self.document.get("dangling") or ())
+        context.drop("edges to nowhere", self.lost["dangling"], "Nav2 refuses a graph with one, and loses the old one")
+        return orjson.dumps(head)[:-1] + b',"features":[\n' + b",\n".join(rows) + b"\n]}\n"
+
+    def _head(self) -> dict[str, Any]:
+        members = self.document.get("members")
+        head = {w: v for w, v in members.items() if w not in ("type", "features")} if isinstance(members, dict) else {}
+        if not self.document:
+            head = {"name": self.context.title, "crs": CRS}
+            self.context.fill("name", self.context.title, "no source names the graph")
+            self.context.fill("crs", CRS["properties"], "QGIS shows metres by it; the route server ignores it")
+        if self.context.attribution and not head.keys() & {"attribution", "license", "copyright"}:
+            head["attribution"] = "; ".join(self.context.attribution)
+        return head
+
+    def _feature(self, item: Node | Edge, n: int, geometry: dict[str, Any], ends: dict[str, int]) -> bytes:
+        """One line of the file."""
+        p = item.properties
+        mine = own(p, NAME)
+        said = mine.get("properties")
+        properties: dict[str, Any] = {"id": n, **ends}
+        if NAME not in p and not ends:
+            properties["frame"] = FRAME
+        if isinstance(said, dict):
+            properties |= {w: v for w, v in said.items() if w not in properties}
+        metadata = properties.get("metadata")
+        more = self._metadata(p, str(n))
+        if more and isinstance(metadata, (dict, type(None))):
+            properties["metadata"] = {**(metadata or {}), **more}
+        for word in ("metadata", "operations"):
+            if word in properties:
+                properties[word] = _floats(properties[word])
+        for reason in _doubts(properties):
+            self.context.warn(reason, where=str(n))
+        self.lost["attributes"] += bool(p.keys() - (CANONICAL_EDGE if ends else CANONICAL_NODE))
+        self.lost["dangling"] += len(mine.get("dangling") or ())
+        members = mine.get("members")
+        row = {"type": "Feature", "properties": properties, "geometry": geometry}
+        if isinstance(members, dict):
+            row |= {w: v for w, v in members.items() if w not in row}
+        return orjson.dumps(row)
+
+    def _metadata(self, p: Properties, number: str) -> dict[str, Any]:
+        """The canonical words among the metadata."""
+        out: dict[str, Any] = {}
+        for word, canonical in LIFTED.items():
+            value: Any = p.get(canonical)
+            if _fits(word, value):
+                out[word] = float(value) if word in NUMBERS else value
+        if out.get("name") == number:
+            del out["name"]
+        return out
+
+    def _shape(self, edge: Edge) -> dict[str, Any]:
+        mine = own(edge.properties, NAME)
+        kind = "LineString" if mine.get("line") is True else "MultiLineString"
+        odd = mine.get("geometry")
+        if isinstance(odd, dict):
+            return {"type": kind, **{w: v for w, v in odd.items() if w != "type"}}
+        if edge.geometry is None or shapely.get_num_coordinates(edge.geometry) < 2:
+            ends = [self.net.nodes[edge.source], self.net.nodes[edge.target]]
+            at: NDArray[np.float64] = np.array([(n.x, n.y) for n in ends])
+        else:
+            at = shapely.get_coordinates(edge.geometry, include_z=bool(shapely.has_z(edge.geometry)))
+        coordinates = (np.round(at, METRES) + 0.0).tolist()
+        return {"type": kind, "coordinates": coordinates if kind == "LineString" else [coordinates]}
+
+    def _report(self) -> None:
+        net, context, lost = self.net, self.context, self.lost
+        if len(set(net.levels)) > 1:
+            context.drop("levels of nodes", len(net.nodes), "all networks are joined into one graph")
+        foreign = sum(NAME not in n.properties for n in net.nodes) + sum(NAME not in e.properties for e in net.edges)
+        if foreign:
+            context.fill("id", "a number made from each id", f"{foreign} nodes and edges have no number of their own")
+        context.drop(
+            "items with attributes that Nav2 has no word for", lost["attributes"], "other formats' own knowledge"
+        )
+
+
+def _claim(item: Node | Edge) -> int | None:
+    """The number that an item has from its source."""
+    said = own(item.properties, NAME).get("id")
+    return said if isinstance(said, int) and not isinstance(said, bool) and 0 <= said <= MAX_ID else None
+
+
+def _own_numbers(items: Sequence[Node | Edge]) -> dict[int, int]:
+    """Place -> number of the items that have one; of several with the same, the one whose id still says it."""
+    claims: dict[int, list[int]] = defaultdict(list)
+    for k, item in enumerate(items):
+        n = _claim(item)
+        if n is not None:
+            claims[n].append(k)
+    return {min(rivals, key=lambda k: (items[k].id != str(n), items[k].id)): n for n, rivals in claims.items()}
+
+
+def _numbered(items: Sequence[Node | Edge], known: Mapping[int, int], taken: set[int]) -> dict[int, int]:
+    """Place -> number of all items; ``taken`` grows. Ids that are numbers come before those that one is made from."""
+    out = dict(known)
+    rest = sorted((k for k in range(len(items)) if k not in out), key=lambda k: items[k].id)
+    for k in rest:
+        if _is_number(items[k].id) and int(items[k].id) not in taken:
+            out[k] = int(items[k].id)
+            taken.add(out[k])
+    size = 2**16 if len(items) <= MAX_USED_ID // 2 else 2**32
+    for k in rest:
+        if k not in out:
+            out[k] = next(n for n in _candidates(items[k].id, size) if n not in taken)
+            taken.add(out[k])
+    return out
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) <= 5 and str(int(text)) == text and int(text) <= MAX_USED_ID
+
+
+def _candidates(text: str, size: int) -> Iterable[int]:
+    """Numbers below ``size`` that follow from a text, one after the other."""
+    first = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "big")
+    step = first >> 32 | 1  # odd, so that all numbers come
+    return ((first + k * step) % size for k in range(size))
+
+
+# --- the format ------------------------------------------------------------------------------------------------------
+
+
+def detect(name: str, data: bytes) -> bool:  # noqa: ARG001 - one signature for all formats
+    """A JSON object of features with the route server's own words."""
+    if data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")[:1] != b"{":
+        return False
+    return b'"startid"' in data and b'"endid"' in data and b'"features"' in data
+
+
+register(
+    Format(
+        name=NAME,
+        title="Route graph (Nav2 route server)",
+        files=("graph.geojson",),
+        media_types=("application/geo+json",),
+        carries=frozenset({"topology"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        family=NAME,
+        rank=36,
+        extensions=(".geojson", ".json"),
+    )
+)
