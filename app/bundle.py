@@ -6,9 +6,10 @@ files that tell one network, the richer format wins; the others stay sources. No
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 
@@ -98,10 +99,13 @@ class Bundle:
 def unpack(files: Files, limits: Limits) -> dict[str, bytes]:
     """The files, each ``.zip`` among them replaced by its members (a KMZ is a format, not a folder)."""
     out: dict[str, bytes] = {}
+    left = limits.unpacked_bytes
     for name, data in files.items():
         members = {name: data}
         if name.lower().endswith(".zip") and data[:2] == b"PK":
-            members = _archive.unpack(data, limits)
+            with _blamed_on(name):
+                members = _archive.unpack(data, dataclasses.replace(limits, unpacked_bytes=left))
+            left -= sum(map(len, members.values()))
         for member, content in members.items():
             if member in out:
                 raise BadUpload(
@@ -112,6 +116,16 @@ def unpack(files: Files, limits: Limits) -> dict[str, bytes]:
     if len(out) > limits.files:
         raise BadUpload(f"the upload has {len(out)} files; the limit is {limits.files}")
     return out
+
+
+@contextlib.contextmanager
+def _blamed_on(name: str) -> Iterator[None]:
+    """Errors within are told as this file's."""
+    try:
+        yield
+    except BadUpload as error:
+        places = [dataclasses.replace(p, file=name) for p in error.problems] or [Problem(error.detail, name)]
+        raise type(error)(f"{name}: {error.detail}", places) from error
 
 
 def read(files: Files, hints: Hints, known: Known, limits: Limits) -> Bundle:
@@ -194,7 +208,8 @@ def _read_variables(files: Files, bundle: Bundle) -> set[str]:
     variables: dict[str, str] = {}
     names = sorted(n for n in files if PurePosixPath(n).name in ("properties.sh", "environment.sh") and files[n])
     for name in names:
-        assigned, doubts = _shell.assignments(files[name])
+        with _blamed_on(name):
+            assigned, doubts = _shell.assignments(files[name])
         variables.update(assigned)
         bundle.files[name] = Use("environment", used=True)
         bundle.warnings += [Problem(doubt, name) for doubt in doubts]
@@ -426,7 +441,8 @@ def _join(told: list[Read], renamed: dict[str, dict[str, str]]) -> Part:
         new = renamed.get(told[0].group.main, {})
         if told[0].key.layer == "topology" and isinstance(part, Features) and new:
             properties = [
-                {**p, "drawn_from": new[p["drawn_from"]]} if p.get("drawn_from") in new else p for p in part.properties
+                {**p, "drawn_from": new[i]} if isinstance(i := p.get("drawn_from"), str) and i in new else p
+                for p in part.properties
             ]
             part = Features(part.ids, part.geometry, tuple(properties), part.local, part.document)
         return part

@@ -82,10 +82,10 @@ class Pool:
         if not self._slots.acquire(blocking=False):
             raise Unavailable("too many conversions are waiting: try again in a few seconds")
         try:
-            if self._closed:
-                raise Unavailable("the server is stopping")
             worker, healthy = self._idle.get(), False
             try:
+                if self._closed:
+                    raise Unavailable("the server is stopping")
                 worker = worker or self._new()
                 ok, value = _ask(worker, function, args, self._seconds if seconds is None else seconds)
                 healthy = True
@@ -108,11 +108,19 @@ class Pool:
             self._end(worker)
 
     def _new(self) -> _Worker:
-        ours, theirs = _spawn.Pipe()
+        try:
+            ours, theirs = _spawn.Pipe()
+        except OSError as error:
+            raise Unavailable("the system lets no further file be opened: try again in a few seconds") from error
         arguments = (theirs, os.getpid(), self._memory_bytes, self._warm, self._allowed)
         process = _spawn.Process(target=_work, args=arguments, daemon=True, name="fleetmap-worker")
-        process.start()
-        theirs.close()
+        try:
+            process.start()
+        except OSError as error:
+            ours.close()
+            raise Unavailable("the system lets no further process start: try again in a few seconds") from error
+        finally:
+            theirs.close()
         worker = _Worker(process, ours)
         with self._lock:
             self._workers[id(worker)] = worker
@@ -163,7 +171,7 @@ def _work(pipe: Connection, parent: int, memory_bytes: int, warm: tuple[str, ...
                 target = getattr(target, part)
             answer = (True, target(*args))
         except MemoryError:
-            answer = (False, TooLarge("it needs more memory than an upload may use"))
+            answer = (False, _no_memory())
         except FleetMapError as error:
             answer = (False, error)
         except Exception as error:  # noqa: BLE001  a bug of ours: told to the parent with its trace, for the log
@@ -173,9 +181,17 @@ def _work(pipe: Connection, parent: int, memory_bytes: int, warm: tuple[str, ...
             pipe.send(answer)
         except (OSError, BrokenPipeError):
             return
+        except MemoryError:
+            answer = (False, None)  # lets go of the result before anything else is made
+            with contextlib.suppress(OSError):
+                pipe.send((False, _no_memory()))
         except Exception as error:  # noqa: BLE001  an answer that cannot be pickled is a bug of ours too
             with contextlib.suppress(OSError):
                 pipe.send((False, RuntimeError(f"a worker's answer could not be sent: {error}")))
+
+
+def _no_memory() -> TooLarge:
+    return TooLarge("it needs more memory than an upload may use")
 
 
 def _die_with(parent: int) -> None:

@@ -59,6 +59,17 @@ def work_eat() -> int:
     return len(bytearray(64 * 2**30))
 
 
+class _Unsendable:
+    """A result that takes more memory to send than there is."""
+
+    def __reduce__(self) -> tuple[type[bytes], tuple[bytes]]:
+        return bytes, (bytes(64 * 2**30),)
+
+
+def work_unsendable() -> _Unsendable:
+    return _Unsendable()
+
+
 @pytest.fixture
 def pool() -> Iterator[Pool]:
     made = Pool(1, memory_bytes=4 * 2**30, seconds=20.0, waiting=1)
@@ -100,6 +111,44 @@ def test_memory_is_limited_and_the_worker_survives(pool: Pool) -> None:
     with pytest.raises(TooLarge):
         pool.run(work_eat)
     assert pool.run(work_double, 1) == 2
+
+
+def test_a_result_too_large_to_send_is_no_bug(pool: Pool) -> None:
+    with pytest.raises(TooLarge):
+        pool.run(work_unsendable)
+    assert pool.run(work_double, 1) == 2
+
+
+def test_no_process_to_be_had_is_told_as_for_now(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("multiprocessing.context.SpawnProcess._Popen", refuse)
+        with pytest.raises(Unavailable, match="try again"):
+            pool.run(work_double, 1)
+    assert pool.run(work_double, 1) == 2
+
+
+def test_who_waits_when_the_pool_closes_is_told_so(pool: Pool) -> None:
+    pool.run(work_double, 1)
+    told: list[type[BaseException]] = []
+
+    def run(*job: object) -> None:
+        try:
+            pool.run(*job)  # type: ignore[arg-type]
+        except (Unavailable, WorkerDied) as error:
+            told.append(type(error))
+
+    threads = [threading.Thread(target=run, args=job) for job in ((work_sleep, 30.0), (work_double, 1))]
+    for thread in threads:
+        thread.start()
+        time.sleep(0.3)
+    pool.close()
+    for thread in threads:
+        thread.join(10)
+        assert not thread.is_alive()
+    assert told == [WorkerDied, Unavailable]
 
 
 def test_who_is_too_many_is_told_to_come_again(pool: Pool) -> None:

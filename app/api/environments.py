@@ -84,7 +84,13 @@ def list_environments(
     here: Here,
     who: Viewer,
     q: Annotated[
-        str | None, Query(max_length=200, description="Text in name, title, description or tags.", examples=["farm"])
+        str | None,
+        Query(
+            max_length=200,
+            pattern=r"^[^\x00]*$",
+            description="Text in name, title, description or tags.",
+            examples=["farm"],
+        ),
     ] = None,
     contains: Annotated[
         str | None,

@@ -138,7 +138,7 @@ def _credit(key: PartKey, layers: Layers, entries: Mapping[PartKey, PartEntry]) 
         return list(entries[key].provenance.attribution)
     part = layers.parts.get(key)
     said = part.document.get("attribution", ()) if isinstance(part, Features) else ()
-    return [str(text) for text in said]
+    return [text for text in said if isinstance(text, str)] if isinstance(said, list | tuple) else []
 
 
 def credits_of(lines: Iterable[Mapping[str, Any]]) -> list[str]:

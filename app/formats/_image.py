@@ -320,6 +320,7 @@ def _checked_png(data: bytes, limits: Limits) -> bytes:
     """The PNG with only the chunks that make its pixels, each one's checksum verified (Pillow skips that of IDAT)."""
     at, kept, packed = 8, [data[:8]], 0
     width = height = depth = colour = 0
+    palette = False
     while True:
         if at + 12 > len(data):
             raise UnreadableFile("the PNG picture is cut short")
@@ -334,6 +335,7 @@ def _checked_png(data: bytes, limits: Limits) -> bytes:
                 raise UnreadableFile("the PNG picture does not begin with its header")
             width, height, depth, colour = struct.unpack(">IIBB", data[16:26])
             _check_size(width, height, limits)
+        palette = palette or kind == b"PLTE"
         if kind in (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"):
             kept.append(data[at:end])
             packed += size if kind == b"IDAT" else 0
@@ -342,6 +344,8 @@ def _checked_png(data: bytes, limits: Limits) -> bytes:
         at = end
         if kind == b"IEND":
             break
+    if colour == 3 and not palette:
+        raise UnreadableFile("the PNG picture's pixels point into a palette, and it has none")
     bits = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 1) * depth
     if (width * bits // 8) * height > packed * DEFLATE_RATIO:
         raise UnreadableFile(f"the PNG picture says {width} × {height} pixels, but {packed} bytes cannot hold them")

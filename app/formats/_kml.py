@@ -970,7 +970,7 @@ def _identify(
 ) -> tuple[list[str], list[tuple[etree._Element, str] | None]]:
     """Ids (the id attribute where it is the only one of its kind, else the name) and (element, text) of the names."""
     attributes = [
-        e.get("id") or next((v for a, v in e.attrib.items() if a.endswith("}id")), "") if e.attrib else ""
+        e.get("id") or next((v for a, v in _xml.attributes(e).items() if a.endswith("}id")), "") if e.attrib else ""
         for e in (item.element for item in items)
     ]
     counts = Counter(attributes)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 from urllib.parse import unquote
+from xml.parsers import expat
 
 import numpy as np
 import orjson
@@ -96,7 +97,7 @@ def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, tak
         part = parts[key]
         rest: Features | None = part
         if key.layer == "objects" and key.name == FAMILY:
-            kept, rest = _drawings(key, part, frame)
+            kept, rest = _drawings(key, part, frame, context)
             documents += kept
         elif key.layer == "topology":
             rest = _undrawn(part, drawn)
@@ -179,10 +180,12 @@ def _coordinate_texts(
     types = shapely.get_type_id(parts)
     area = types == 3
     count = np.where(area, 1 + np.maximum(shapely.get_num_interior_rings(parts), 0), 1)
+    nothing = shapely.is_empty(parts)
+    count[nothing] = 0
     part_of = np.repeat(np.arange(len(parts)), count)
     lists = np.empty(len(part_of), object)
     from_area = area[part_of]
-    lists[~from_area] = parts[~area]
+    lists[~from_area] = parts[~area & ~nothing]
     lists[from_area] = shapely.get_rings(parts[area])
     points, list_of = shapely.get_coordinates(lists, include_z=True, return_index=True)
     columns = [_text.numbers(points[:, 0], decimals), _text.numbers(points[:, 1], decimals)]
@@ -205,7 +208,7 @@ def _coordinate_texts(
             a = bounds[k]
             texts[k] = glue.join([positions[a], positions[a + 1], positions[a + 3]])
     places = np.searchsorted(owner[part_of], np.arange(len(geometry) + 1)).tolist()
-    words = [_LETTERS.get(t, f"A{n}") for t, n in zip(types.tolist(), count.tolist(), strict=True)]
+    words = [_LETTERS.get(t, f"A{n}") if n else "" for t, n in zip(types.tolist(), count.tolist(), strict=True)]
     own = np.searchsorted(owner, np.arange(len(geometry) + 1)).tolist()
     several = (shapely.get_type_id(geometry) > 3).tolist()
     shape = [
@@ -252,7 +255,7 @@ def _element(geometry: Any, lists: Iterator[str], extra: str = "") -> str:
 
 def _undrawn(part: Features, drawn: set[str]) -> Features | None:
     """A network without what was made from a drawing that is written too; None where nothing else is in it."""
-    made = [p.get("drawn_from") in drawn if "drawn_from" in p else False for p in part.properties]
+    made = [isinstance(i := p.get("drawn_from"), str) and i in drawn for p in part.properties]
     if not any(made):
         return part
     return part.take(~np.array(made)) if not all(made) else None
@@ -451,10 +454,8 @@ def _drawn_together(layers: Layers) -> dict[PartKey, Features]:
         if key.layer not in ("location", "zones"):
             continue
         said = part.document.get(FAMILY)
-        known = said.get("documents", {}) if isinstance(said, Mapping) else {}
-        drawn = np.array(
-            [isinstance(k := p.get(FAMILY), Mapping) and k.get("document") in known for p in part.properties]
-        )
+        known = _skeletons(part)
+        drawn = np.array([_kept(p, known) is not None for p in part.properties])
         if not drawn.any():
             continue
         home = PartKey("objects", key.level, FAMILY)
@@ -469,35 +470,84 @@ def _drawn_together(layers: Layers) -> dict[PartKey, Features]:
     return out
 
 
-def _drawings(key: PartKey, part: Features, frame: LocalFrame | None) -> tuple[list[_Document], Features | None]:
-    """The uploaded drawings with their items in place, and the objects that belong to none of them."""
+def _skeletons(part: Features) -> dict[str, Mapping[str, Any]]:
+    """The drawings that a part remembers, by name. Edits can put anything there: what does not fit is left out."""
     said = part.document.get(FAMILY)
     known = said.get("documents") if isinstance(said, Mapping) else None
-    known = known if isinstance(known, Mapping) else {}
+    return {
+        name: document
+        for name, document in (known.items() if isinstance(known, Mapping) else ())
+        if isinstance(document, Mapping)
+        and isinstance(document.get("xml"), str)
+        and isinstance(document.get("entry"), str | None)
+    }
+
+
+def _kept(p: Properties, known: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """What an item remembers of its element in one of the known drawings, where that can be made use of."""
+    kept = p.get(FAMILY)
+    usable = (
+        isinstance(kept, Mapping)
+        and isinstance(name := kept.get("document"), str)
+        and name in known
+        and isinstance(kept.get("xml"), str)
+        and isinstance(kept.get("shape"), str | None)
+        and isinstance(kept.get("place", 0), int)
+    )
+    return kept if usable else None
+
+
+def _drawings(
+    key: PartKey, part: Features, frame: LocalFrame | None, context: WriteContext
+) -> tuple[list[_Document], Features | None]:
+    """The uploaded drawings with their items in place, and the objects that belong to none of them."""
+    known = _skeletons(part)
     geometry = part.in_wgs84(frame)
     texts = _degrees(geometry, thin=True)
     placed: dict[str, list[tuple[int, int, str]]] = {name: [] for name in known}
     loose = []
     roots = {name: _declarations(document["xml"]) for name, document in known.items()}
     for k, p in enumerate(part.properties):
-        kept = p.get(FAMILY)
-        if not isinstance(kept, Mapping) or kept.get("document") not in known or not isinstance(kept.get("xml"), str):
+        kept = _kept(p, known)
+        if kept is None:
             loose.append(k)
             continue
         name = kept["document"]
-        xml = _filled(kept, p, geometry[k], texts, k, roots[name])
-        placed[name].append((int(kept.get("place", 0)), k, xml))
-    documents = [
-        _Document(key.level, name, document.get("entry"), _in_place(document["xml"], sorted(placed[name])))
-        for name, document in sorted(known.items())
-    ]
-    return documents, part.take(loose) if loose else None
+        try:
+            placed[name].append((kept.get("place", 0), k, _filled(kept, p, geometry[k], texts, k, roots[name])))
+        except (etree.LxmlError, ValueError, LookupError, AttributeError, StopIteration):
+            loose.append(k)  # not an element as it was read from a file
+    documents = []
+    for name, document in sorted(known.items()):
+        items = sorted(placed[name])
+        whole = _in_place(document["xml"], items)
+        if not _well_formed(whole):
+            bad = {k for _, k, xml in items if not _well_formed(f"<w{roots[name]}>{xml}</w>")}
+            items = [item for item in items if item[1] not in bad]
+            whole = _in_place(document["xml"], items)
+            if not _well_formed(whole):
+                bad.update(k for _, k, _ in items)
+                context.drop("drawing", 1, "what is remembered of its document is damaged; its objects are written")
+                whole = ""
+            loose += bad
+        if whole:
+            documents.append(_Document(key.level, name, document.get("entry"), whole))
+    return documents, part.take(sorted(loose)) if loose else None
+
+
+def _well_formed(xml: str) -> bool:
+    """Whether it is XML, its prefixes declared."""
+    try:
+        expat.ParserCreate(namespace_separator=" ").Parse(xml, True)
+    except (expat.ExpatError, UnicodeError):
+        return False
+    return True
 
 
 def _in_place(skeleton: str, items: Sequence[tuple[int, int, str]]) -> str:
     """A document with its items where they stood."""
     pieces = _ITEMS.split(skeleton)
-    starts = [int(n) for n in pieces[1::2]]
+    starts = [int(n[:18]) for n in pieces[1::2]]
     groups: list[list[str]] = [[] for _ in starts]
     over: list[str] = []
     for place, _, xml in items:

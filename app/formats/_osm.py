@@ -23,8 +23,7 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Limits
-from app.formats._xml import check_prolog
+from app.formats import Limits, _xml
 
 Attributes = dict[str, str]
 Tags = dict[str, str]
@@ -91,7 +90,7 @@ def parse(data: bytes, limits: Limits, *, highways_only: bool = False) -> Data:
         return _pbf(data, limits)
     if not data.strip():
         raise UnreadableFile("the file is empty", [Problem("empty file", line=1)])
-    check_prolog(data)
+    _xml.check_prolog(data)
     return _scan(data, limits, highways_only) or _events(data, limits)
 
 
@@ -207,7 +206,12 @@ def _scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
         pieces.pop()
         if len(pieces) != len(tagged):
             return None
+        seen = 0
         for k, piece in zip(tagged, pieces, strict=True):
+            seen += piece.count(b"<node ")
+            if seen != k + 1:
+                # A node inside another one: the careful way tells of it.
+                return None
             body = piece[piece.rfind(b"<node ") :]
             tags[k] = children.tags(body, 1)
     ways = _scan_ways(data, children, highways_only)
@@ -429,7 +433,7 @@ class _Careful:
             _refuse(f"<{element.tag}> is no element of an OSM file", element)
 
     def attributes(self, element: etree._Element) -> Attributes:
-        out = {str(k): str(v) for k, v in element.attrib.items()}
+        out = _xml.attributes(element)
         most = self.limits.xml_attribute_bytes
         if any(len(v) > most for v in out.values()):
             _refuse(f"an attribute is longer than {most} characters", element)

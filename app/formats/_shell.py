@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from app.errors import TooLarge
+from app.errors import Problem, TooLarge, UnreadableFile
 from app.model.frame import is_writable
 
 MAX_BYTES = 2**20
@@ -61,11 +61,16 @@ _DANGEROUS = re.compile(
 def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
     """The variables that hold a literal whenever the file is sourced, and what was left out, in words.
 
-    Raises TooLarge beyond 1 MiB, UnicodeDecodeError where the file is no UTF-8.
+    Raises TooLarge beyond 1 MiB, UnreadableFile where the file is no UTF-8.
     """
     if len(data) > MAX_BYTES:
         raise TooLarge(f"a file of shell variables may have {MAX_BYTES} bytes, this one has {len(data)}")
-    text = data.decode("utf-8-sig").replace("\r\n", "\n")
+    try:
+        text = data.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        reason = f"not UTF-8 text (byte 0x{error.object[error.start]:02x}); save the file as UTF-8"
+        line = error.object.count(b"\n", 0, error.start) + 1
+        raise UnreadableFile(f"line {line}: {reason}", [Problem(reason, line=line)]) from error
     known: dict[str, str] = {}
     warnings: list[str] = []
     others: list[int] = []

@@ -11,6 +11,9 @@ METRES = 9
 DEGREES = 12
 """Decimals to round to: a nanometre, and a tenth of a micrometre on the ground."""
 
+_WHOLE = 2.0**53
+"""From here on a float has no decimals, and rounding would overflow on the way."""
+
 
 def number(value: float, decimals: int = METRES) -> str:
     """The shortest text that reads back as the rounded value; always with a point or an exponent, never ``-0.0``."""
@@ -19,5 +22,9 @@ def number(value: float, decimals: int = METRES) -> str:
 
 def numbers(values: NDArray[np.float64] | Iterable[float], decimals: int = METRES) -> list[str]:
     """The same for many values at once."""
-    rounded = np.round(np.asarray(values, np.float64), decimals) + 0.0
+    exact = np.asarray(values, np.float64)
+    rounded = np.round(np.clip(exact, -_WHOLE, _WHOLE), decimals) + 0.0
+    large = np.abs(exact) >= _WHOLE
+    if large.any():
+        rounded[large] = exact[large]
     return list(map(repr, rounded.tolist()))

@@ -14,6 +14,10 @@ _PROLOG = re.compile(rb"\s+|<\?.*?\?>|<!--.*?-->", re.DOTALL)
 """What may stand before the root element. A DOCTYPE further inside is a text (HTML in a description)."""
 
 
+MAX_ATTRIBUTES = 256
+"""Of one element. Real ones have about ten; lxml takes quadratic time to list them."""
+
+
 def parse(
     data: bytes, limits: Limits, *, keep_comments: bool = False, remove_blank_text: bool = False
 ) -> etree._Element:
@@ -52,6 +56,15 @@ def check_prolog(data: bytes) -> None:
         line = head.count(b"\n", 0, at) + 1
         reason = "DOCTYPE and entity declarations are not accepted: remove them"
         raise UnreadableFile(reason, [Problem(reason, line=line)])
+
+
+def attributes(element: etree._Element) -> dict[str, str]:
+    """An element's attributes. Raises UnreadableFile where there are more than any real file has."""
+    count = len(element.attrib)
+    if count > MAX_ATTRIBUTES:
+        reason = f"<{element.tag}> has {count} attributes; the limit is {MAX_ATTRIBUTES}"
+        raise UnreadableFile(reason, [Problem(reason, line=element.sourceline, where=f"<{element.tag}>")])
+    return {str(k): str(v) for k, v in element.attrib.items()}
 
 
 def check_bounds(root: etree._Element, limits: Limits, data: bytes | None = None) -> None:

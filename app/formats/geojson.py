@@ -591,7 +591,8 @@ class _Writer:
         words = {"layer": key.layer, "level": key.level, "part": key.name}
         rows = []
         for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
-            if key.layer == "topology" and (key.level, p.get("drawn_from")) in drawn:
+            origin = p.get("drawn_from")
+            if key.layer == "topology" and isinstance(origin, str) and (key.level, origin) in drawn:
                 # The drawing it was made from is written; with the network it would stand there twice.
                 continue
             place = metres.get(k)

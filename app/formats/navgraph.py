@@ -540,7 +540,7 @@ def _reach(start: int, onward: Mapping[int, Sequence[int]], seen: set[int]) -> b
 
 def _listed(properties: Mapping[str, Any], words: Any, column: int) -> str:
     """A mapping as a list of one-key mappings, sorted, and bare words where the value still is true."""
-    bare = frozenset(words) if isinstance(words, list) else frozenset()
+    bare = frozenset(w for w in words if isinstance(w, str)) if isinstance(words, list) else frozenset()
     pad = " " * column
     out = []
     for key in sorted(properties):

@@ -535,7 +535,7 @@ class _Writer:
         topology = list(self.layers.vector("topology", name).values())
         for part in topology:
             self.network_nodes(part, level)
-            drawn.update(p.get("drawn_from") for p in part.properties if "drawn_from" in p)
+            drawn.update(i for p in part.properties if isinstance(i := p.get("drawn_from"), str))
         others: list[tuple[str, Any, Properties, bool]] = []
         mine: list[tuple[str, int, Any, Mapping[str, Any], Mapping[str, Any]]] = []
         for layer in ("objects", "zones"):
@@ -574,7 +574,10 @@ class _Writer:
         is_node = np.array([p.get("kind") != "edge" for p in part.properties], bool)
         chosen = np.flatnonzero(is_node)
         at = part.take(chosen).in_wgs84(self.layers.frame) if len(chosen) else np.empty(0, object)
-        lon, lat = shapely.get_x(at).tolist(), shapely.get_y(at).tolist()
+        here = (shapely.get_type_id(at) == 0) & ~shapely.is_empty(at)
+        places = np.full((len(at), 2), np.nan)
+        places[here] = shapely.get_coordinates(at[here])
+        lon, lat = places.T.tolist()
         for k, x, y, geometry in zip(chosen.tolist(), lon, lat, at, strict=True):
             i, properties = part.ids[k], part.properties[k]
             said = properties.get("osm")
@@ -591,7 +594,7 @@ class _Writer:
                 # A street node that went through another format is called by its id there: that is no name.
                 nameless = own and properties.get("name", i) == i
                 tags, attributes = NOTHING if nameless else self.tags(i, properties, ("name",)), NOTHING
-            if geometry.has_z and "ele" not in tags:
+            if geometry.has_z and geometry.geom_type == "Point" and not geometry.is_empty and "ele" not in tags:
                 tags = {**tags, "ele": repr(float(geometry.z))}
             self.nodes[new] = _Node(x, y, tags, attributes)
             level.nodes[i] = new
@@ -963,7 +966,7 @@ class _Writer:
         for one in said:
             rows = one.get("elements")
             for row in rows if isinstance(rows, list) else []:
-                name, attributes, text = row
+                name, attributes, text = row if isinstance(row, list) and len(row) == 3 else ("", None, "")
                 if _NAME.fullmatch(str(name)):
                     inner = _escape(str(text))
                     lines.append(f" <{name}{_attribute_text(_texts(attributes), frozenset())}>{inner}</{name}>")

@@ -647,3 +647,17 @@ def test_memory_stays_within_ten_times_the_input() -> None:
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert peak < 10 * len(data)
+
+
+@pytest.mark.parametrize("quote", ["'", '"'])
+def test_a_node_inside_a_node_belongs_to_it_and_is_told(quote: str) -> None:
+    body = "<node id='2' lat='1' lon='1'><node id='3' lat='2' lon='2'/></node><node id='4' lat='1' lon='2'/>"
+    context = ReadContext()
+    read(xml(body.replace("'", quote)), context)
+    assert any("<node> inside <node>" in w.problem for w in context.warnings)
+
+
+def test_more_attributes_than_any_element_has() -> None:
+    many = " ".join(f"a{k}='x'" for k in range(50_000))
+    with pytest.raises(UnreadableFile, match="50001 attributes"):
+        read(f"<osm version='0.6' {many}></osm>".encode())

@@ -1,0 +1,736 @@
+"""Hostile uploads, made up by name: what each holds is said here, and whether it must be refused.
+
+``verdict``: ``refused`` (never stored), ``read`` (odd, but real: taken in, with a warning where one is due) or ``any``
+(damage that may or may not be noticed; never a hang, never a crash).
+"""
+
+# ruff: noqa: E501, UP031 - lines of data, one case each; braces of JSON
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import random
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+SAMPLES = Path(__file__).resolve().parents[1] / "samples"
+
+Verdict = Literal["refused", "read", "any"]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One upload. format: what the sender says it is."""
+
+    name: str
+    files: dict[str, bytes]
+    verdict: Verdict
+    format: str | None = None
+
+
+# --- building stones ---------------------------------------------------------------------------------------------
+
+
+def chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def png(width: int, height: int, pixels: bytes | None, *, depth: int = 8, colour: int = 0, more: bytes = b"") -> bytes:
+    """A PNG with this header; ``pixels`` are the packed rows, None: a few bytes that cannot be all of it."""
+    body = zlib.compress(b"\0" * 64 if pixels is None else pixels, 9)
+    head = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + more + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+
+
+def zipped(members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", method) as archive:
+        for name, body in members.items():
+            archive.writestr(zipfile.ZipInfo(name), body, method)
+    return out.getvalue()
+
+
+def raw_zip(members: list[tuple[bytes, bytes, dict[str, int]]]) -> bytes:
+    """A stored archive made by hand, so that it can lie: per member name, body, and fields of headers to override."""
+    out, directory = b"", b""
+    for name, body, lies in members:
+        crc = lies.get("crc", zlib.crc32(body))
+        size, packed = lies.get("size", len(body)), lies.get("packed", len(body))
+        flags, method = lies.get("flags", 0x800), lies.get("method", 0)
+        start = lies.get("start", len(out))
+        out += struct.pack("<4s5H3L2H", b"PK\3\4", 20, flags, method, 0, 33, crc, packed, size, len(name), 0)
+        out += name + body
+        attributes = lies.get("mode", 0o100644) << 16
+        directory += struct.pack(
+            "<4s6H3L5H2L", b"PK\1\2", 0x314, 20, flags, method, 0, 33, crc, packed,
+            lies.get("central_size", size), len(name), 0, 0, 0, 0, attributes, start,
+        )  # fmt: skip
+        directory += name
+    count = len(members)
+    return out + directory + struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, count, count, len(directory), len(out), 0)
+
+
+ROOM = (
+    b"image: room.pgm\nresolution: 0.5\norigin: [0.0, 0.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+)
+PGM = b"P5 4 3 255\n" + bytes(12)
+KML = (
+    '<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>{name}</name>'
+    "<Point><coordinates>{at}</coordinates></Point></Placemark></Document></kml>"
+)
+OSM = "<osm version='0.6'><node id='{id}' lat='{lat}' lon='{lon}'/></osm>"
+DATUM = "datum_latitude: {lat}\ndatum_longitude: {lon}\n"
+
+
+def tmap2(name: str = "a", x: str = "1.0", edges: str = "[]", extra: str = "", verts: str = "[]") -> bytes:
+    return (
+        "meta: {last_updated: x}\nmetric_map: m\nname: net\npointset: net\nnodes:\n"
+        f"- meta: {{map: m, node: {name}, pointset: net}}\n  node:\n    edges: {edges}\n    name: {name}\n"
+        f"    parent_frame: map\n    pose:\n      orientation: {{w: 1.0, x: 0.0, y: 0.0, z: 0.0}}\n"
+        f"      position: {{x: {x}, y: 2.0, z: 0.0}}\n    verts: {verts}\n{extra}"
+    ).encode()
+
+
+def geojson(geometry: str, properties: str = "{}", more: str = "") -> bytes:
+    return (
+        '{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": %s, "geometry": %s%s}]}'
+        % (properties, geometry, more)
+    ).encode()
+
+
+def room(text: bytes = ROOM, picture: bytes = PGM, name: str = "room.pgm") -> dict[str, bytes]:
+    return {"room.yaml": text, name: picture}
+
+
+HUGE = "9" * 5000
+
+
+# --- cases -------------------------------------------------------------------------------------------------------
+
+
+def yaml_cases() -> Iterator[Case]:
+    """What YAML can do, in a datum, a grid and a network."""
+
+    def datum(name: str, tail: str | bytes, verdict: Verdict = "refused") -> Case:
+        body = DATUM.format(lat=53.0, lon=-0.5).encode() + (tail.encode() if isinstance(tail, str) else tail)
+        return Case(f"datum/{name}", {"datum.yaml": body}, verdict, "datum")
+
+    bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+        f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 12)
+    )
+    yield datum("alias bomb", bomb)
+    yield datum("alias of itself", "extra: &a [*a]\n")
+    yield datum("alias without anchor", "extra: *nothing\n")
+    yield datum("brackets", "extra: " + "[" * 60_000 + "\n")
+    yield datum("brackets closed", "extra: " + "[" * 5000 + "]" * 5000 + "\n")
+    yield datum("braces", "extra: " + "{a: " * 60_000 + "\n")
+    yield datum("dashes", "extra:\n" + "".join(" " * k + "-\n" for k in range(1, 400)))
+    yield datum("dashes on one line", "extra:\n  " + "- " * 50_000 + "x\n")
+    yield datum("question marks", "? " * 50_000 + "x\n")
+    yield datum("merge key", "base: &b {a: 1}\nextra:\n  <<: *b\n")
+    yield datum("key twice", "datum_latitude: 12.0\n")
+    yield datum("second document", "---\ndatum_latitude: 1.0\n")
+    yield datum("python tag", "extra: !!python/object/apply:os.system ['true']\n")
+    yield datum("python name", "extra: !!python/name:os.system\n")
+    yield datum("binary tag", "extra: !!binary aGFsbG8=\n")
+    yield datum("own tag", "extra: !mine 1\n")
+    yield datum("long integer", f"extra: {HUGE}\n")
+    yield datum("64 bit and one", f"extra: {2**63}\n")
+    yield datum("not a number", "extra: .nan\n")
+    yield datum("beyond float", "extra: 1.0e999\n")
+    yield datum("complex key", "? [a, b]\n: 1\n")
+    yield datum("tab", "extra:\n\t- 1\n")
+    yield datum("lone surrogate", 'extra: "\\ud800"\n')
+    yield datum("surrogate in bytes", b"extra: \xed\xa0\x80\n")
+    yield datum("latin-1", b"extra: Stra\xdfe\n")
+    yield datum("null byte", b"extra: \0\n")
+    yield datum("sexagesimal", "extra: 12:30:45\nanother: 010\nday: 2022-01-01\n", "read")
+    yield datum("huge text", "extra: '" + "x" * 2_000_000 + "'\n", "read")
+    tag = b"%TAG ! tag:example.org,2000:\n---\n" + DATUM.format(lat=1.0, lon=1.0).encode()
+    yield Case("datum/tag directive", {"datum.yaml": tag}, "refused", "datum")
+    for bad in (
+        ".nan",
+        "-.inf",
+        "1.0e999",
+        "90.5",
+        "-86.0",
+        "true",
+        "[]",
+        "{}",
+        "'north'",
+        "null",
+        HUGE,
+        "0x10",
+        "1_0",
+    ):
+        text = DATUM.format(lat=bad, lon=1.0)
+        yield Case(f"datum/latitude {bad[:12]}", {"datum.yaml": text.encode()}, "any" if bad == "0x10" else "refused")
+    for bad in (".nan", "180.5", "1e999", "-1000", "[1]", HUGE):
+        text = DATUM.format(lat=1.0, lon=bad)
+        yield Case(f"datum/longitude {bad[:12]}", {"datum.yaml": text.encode()}, "refused")
+    for bad in ("5", "[[1]]", "[[a, b]]", "[[1.0, .nan]]", "[[91, 0], [1, 1], [2, 2]]", "{a: 1}", "[[[[1]]]]", "'x'"):
+        text = DATUM.format(lat=1.0, lon=1.0) + f"gnss_fence: {{gnss_fence_coords: {bad}}}\n"
+        yield Case(f"datum/fence {bad[:12]}", {"datum.yaml": text.encode()}, "any")
+    for top in (b"[]", b"5", b"~", b"- datum_latitude: 1\n- datum_longitude: 2\n", b"'datum_latitude: 1'"):
+        yield Case(f"datum/top {top[:10].decode()}", {"datum.yaml": top}, "refused", "datum")
+    for coding in ("utf-16", "utf-16-be", "utf-32", "utf-7"):
+        body = (DATUM.format(lat=1.0, lon=1.0) + "extra: grün\n").encode(coding)
+        yield Case(f"datum/{coding}", {"datum.yaml": body}, "any" if coding == "utf-7" else "refused", "datum")
+
+    for bad in ("0", "-0.5", ".nan", ".inf", "1e999", "true", "[]", "'a'", "null", HUGE, "1.0e-300", "1.0e+300"):
+        text = ROOM.replace(b"resolution: 0.5", f"resolution: {bad}".encode())
+        yield Case(f"grid/resolution {bad[:12]}", room(text), "refused")
+    for bad in ("[0, 0]", "[a, b, c]", "[0, 0, .nan]", "[1.0e300, 0, 0]", "5", "{}", "[0, 0, 0, 0]", "[true, 0, 0]"):
+        text = ROOM.replace(b"[0.0, 0.0, 0.0]", bad.encode())
+        yield Case(f"grid/origin {bad}", room(text), "refused")
+    for bad in ("7.5", "[]", "1.5", "-1", "'x'", ".nan"):
+        text = ROOM.replace(b"occupied_thresh: 0.65", f"occupied_thresh: {bad}".encode())
+        yield Case(f"grid/threshold {bad}", room(text), "refused")
+    escapes = (
+        "../room.pgm", "/etc/passwd", "~/room.pgm", "file:///etc/passwd", "http://127.0.0.1/a.pgm", "..", ".", "room.yaml",
+        "$HOME/x.pgm", "%2e%2e/room2.pgm", "a\\\\b.pgm", "C:\\\\x.pgm", "//host/share.pgm", "{}", "5", "''", "x" * 5000,
+    )  # fmt: skip
+    for said in escapes:
+        text = ROOM.replace(b"image: room.pgm", f'image: "{said}"'.encode() if said != "{}" else b"image: {}")
+        alone = said.rpartition("/")[2] == "room.pgm"
+        yield Case(f"grid/image {said[:20]}", room(text), "read" if alone else "refused")
+    yield Case("grid/image missing", {"room.yaml": ROOM}, "refused")
+    yield Case(
+        "grid/image twice elsewhere",
+        {"a/room.yaml": ROOM.replace(b"room.pgm", b"/x/room.pgm"), "b/room.pgm": PGM, "c/room.pgm": PGM},
+        "refused",
+    )
+
+    edge = "[{action: go, edge_id: e, node: %s}]"
+    yield Case("network/self loop", {"n.tmap2.yaml": tmap2(edges=edge % "a")}, "read")
+    yield Case("network/dangling edge", {"n.tmap2.yaml": tmap2(edges=edge % "nowhere")}, "read")
+    node = tmap2().partition(b"nodes:\n")[2].decode()
+    yield Case("network/name twice", {"n.tmap2.yaml": tmap2(extra=node)}, "read")
+    yield Case("network/bidi name", {"n.tmap2.yaml": tmap2(name='"a\\u202eb"')}, "read")
+    yield Case("network/zero-width name", {"n.tmap2.yaml": tmap2(name='"a\\u200bb"')}, "read")
+    names = ('"a\\u0000b"', '"a\\nb"', '"a\\u001b[31mb"', "''", '"' + "n" * 300 + '"', "[]", "{}", '"\\ud800"', "null")
+    for name in names:
+        verdict: Verdict = "any" if name == "null" else "refused"
+        yield Case(f"network/name {name[:14]}", {"n.tmap2.yaml": tmap2(name=name)}, verdict)
+    for x in (".nan", ".inf", "1e999", "1.0e+300", "'east'", "[]", "null", "true", HUGE):
+        yield Case(f"network/x {x[:12]}", {"n.tmap2.yaml": tmap2(x=x)}, "refused")
+    for edges in ("5", "{}", "[5]", "[[]]", "[{}]", "[{edge_id: [], node: {}}]", "[null]", "'x'", "[{edge_id: e}]"):
+        yield Case(f"network/edges {edges}", {"n.tmap2.yaml": tmap2(edges=edges)}, "any")
+    for verts in ("5", "[5]", "[{x: .nan, y: 1}]", "[{x: a}]", "{}", "[{x: 1.0e+308, y: 1.0e+308}]", "[[1, 2]]"):
+        yield Case(f"network/verts {verts}", {"n.tmap2.yaml": tmap2(verts=verts)}, "any")
+    for nodes in ("5", "[5]", "[{}]", "{a: 1}", "[[]]", "[{node: 5}]", "[{node: {name: a}}]", "[{meta: {}, node: []}]"):
+        yield Case(f"network/nodes {nodes}", {"n.tmap2.yaml": f"name: x\nnodes: {nodes}\n".encode()}, "any", "tmap2")
+
+
+DOCTYPE = '<!DOCTYPE {root} [<!ENTITY a "x"><!ENTITY b SYSTEM "file:///etc/passwd">]>'
+LAUGHS = (
+    '<!DOCTYPE {root} [<!ENTITY a0 "lol">'
+    + "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
+    + "]>"
+)
+
+
+def xml_cases() -> Iterator[Case]:
+    """What XML can do, in a drawing and in an OSM extract."""
+    place = KML.format(name="&b;", at="7,50")
+    extract = "<osm version='0.6'><node id='1' lat='50' lon='7'><tag k='name' v='&a;'/></node></osm>"
+    for root, body, file in (("kml", place, "a.kml"), ("osm", extract, "a.osm")):
+        for kind, doctype in (("entities", DOCTYPE), ("laughs", LAUGHS)):
+            text = doctype.replace("{root}", root) + body
+            space = " \t\r\n"
+            forms = {
+                "plain": text.encode(),
+                "declared": f'<?xml version="1.0"?>{text}'.encode(),
+                "with mark": b"\xef\xbb\xbf" + text.encode(),
+                "after space": (space * 3 + text).encode(),
+                "after comments": ("<!-- <kml> <osm> -->" * 300 + "<?x y?>" + text).encode(),
+                "utf-16": ('<?xml version="1.0" encoding="UTF-16"?>' + text).encode("utf-16"),
+                "utf-16 big": b"\xfe\xff" + text.encode("utf-16-be"),
+                "utf-16 without mark": ('<?xml version="1.0" encoding="UTF-16LE"?>' + text).encode("utf-16-le"),
+                "utf-32": ('<?xml version="1.0" encoding="UTF-32"?>' + text).encode("utf-32"),
+                "utf-7": b'<?xml version="1.0" encoding="UTF-7"?>' + text.encode("utf-7"),
+                "utf-7 escaped": b'<?xml version="1.0" encoding="UTF-7"?>'
+                + text.replace("<!", "+ADwAIQ-").replace("&", "+ACY-").encode(),
+                "ebcdic": '<?xml version="1.0" encoding="cp037"?>'.encode("cp037") + text.encode("cp037"),
+                "late": (" " * 70_000 + text).encode(),
+                "comment of a megabyte": ("<!--" + "x" * 2**20 + "-->" + text).encode(),
+                "long comment, utf-16": ("<!--" + "x" * 2**20 + "-->" + text).encode("utf-16"),
+            }
+            for form, data in forms.items():
+                yield Case(f"{root}/{kind} {form}", {file: data}, "refused", root)
+        outside = f'<!DOCTYPE {root} SYSTEM "http://127.0.0.1:9/x.dtd">{body.replace("&b;", "x").replace("&a;", "x")}'
+        yield Case(f"{root}/outer DTD", {file: outside.encode()}, "refused", root)
+        attribute = " ".join(f"a{k}='x'" for k in range(100_000))
+        yield Case(f"{root}/many attributes", {file: f"<{root} {attribute}></{root}>".encode()}, "any", root)
+        yield Case(f"{root}/long attribute", {file: f"<{root} a='{'x' * 200_000}'></{root}>".encode()}, "refused", root)
+        deep = f"<{root}>" + "<Folder>" * 20_000 + "</Folder>" * 20_000 + f"</{root}>"
+        yield Case(f"{root}/deep", {file: deep.encode()}, "refused", root)
+        yield Case(f"{root}/unclosed", {file: (f"<{root}>" + "<Folder>" * 20_000).encode()}, "refused", root)
+        yield Case(f"{root}/cut", {file: body[: len(body) // 2].encode()}, "refused", root)
+        yield Case(f"{root}/null byte", {file: body.replace("7", "7\0").encode()}, "refused", root)
+        yield Case(f"{root}/character 0", {file: f"<{root}>&#0;</{root}>".encode()}, "refused", root)
+        yield Case(f"{root}/surrogate", {file: f"<{root} a='&#xD800;'></{root}>".encode()}, "refused", root)
+        yield Case(f"{root}/other root", {file: b"<html><body/></html>"}, "refused", root)
+        yield Case(f"{root}/text", {file: b"hello"}, "refused", root)
+        yield Case(f"{root}/two roots", {file: f"<{root}></{root}><{root}></{root}>".encode()}, "refused", root)
+        yield Case(f"{root}/prefixes", {file: (f"<{root}>" + "<a:b/>" * 3 + f"</{root}>").encode()}, "refused", root)
+        yield Case(
+            f"{root}/unknown coding", {file: f"<?xml version='1.0' encoding='x-y'?><{root}/>".encode()}, "refused"
+        )
+    xinclude = '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" parse="text" href="file:///etc/passwd"/>'
+    yield Case("kml/xinclude", {"a.kml": KML.format(name=xinclude, at="7,50").encode()}, "any")
+
+    for at in ("nan,50", "7,inf", "1e999,0", "7,91", "181,0", "x,y", "7", "", ",", "7,50," + HUGE, HUGE + ",50"):
+        verdict: Verdict = "any" if at in ("", "7", ",") else "refused"
+        yield Case(f"kml/place {at[:12]}", {"a.kml": KML.format(name="x", at=at).encode()}, verdict)
+    for inside in (
+        "<LineString><coordinates>7,50</coordinates></LineString>",
+        "<Polygon><outerBoundaryIs><LinearRing><coordinates>7,50 8,50</coordinates></LinearRing></outerBoundaryIs></Polygon>",
+        "<Polygon/>",
+        "<MultiGeometry>" * 200 + "</MultiGeometry>" * 200,
+        "<Point><coordinates>7,50</coordinates><coordinates>8,51</coordinates></Point>",
+    ):
+        body = f"<kml><Placemark>{inside}</Placemark></kml>".encode()
+        yield Case(f"kml/geometry {inside[:30]}", {"a.kml": body}, "any")
+    overlay = (
+        "<kml><GroundOverlay><Icon><href>{href}</href></Icon><LatLonBox><north>{n}</north><south>50</south>"
+        "<east>7.1</east><west>7</west></LatLonBox></GroundOverlay></kml>"
+    )
+    for href in ("../../etc/passwd", "/etc/passwd", "file:///etc/passwd", "http://127.0.0.1:9/x.png", "x" * 10_000):
+        yield Case(f"kml/href {href[:16]}", {"a.kml": overlay.format(href=href, n=50.1).encode()}, "any")
+    for n in ("nan", "1e999", "x", "99", HUGE):
+        yield Case(f"kml/north {n[:8]}", {"a.kml": overlay.format(href="x.png", n=n).encode()}, "any")
+    values = ("nan", "{", "[" * 60_000, HUGE, '"\\ud800"', "1e999", '{"a": NaN}', str(2**70))
+    for value in values:
+        data = f"<ExtendedData><Data name='speed'><value>{value}</value></Data></ExtendedData>"
+        body = f"<kml><Placemark>{data}<Point><coordinates>7,50</coordinates></Point></Placemark></kml>"
+        yield Case(f"kml/value {value[:10]}", {"a.kml": body.encode()}, "any")
+    words = ("layer", "level", "part", "kind", "id", "source", "target", "geometry", "fleet_map", "local", "place")
+    for word in words:
+        for value in ("topology", "[", "5", '{"a": 1}', "null", "", "location", HUGE):
+            data = "".join(
+                f"<Data name='{w}'><value>{value if w == word else o}</value></Data>"
+                for w, o in (
+                    ("layer", "topology"),
+                    ("level", "ground"),
+                    ("part", "network"),
+                    ("kind", "edge"),
+                    (word, ""),
+                )
+            )
+            body = f"<kml><Placemark id='x'><ExtendedData>{data}</ExtendedData></Placemark></kml>"
+            yield Case(f"kml/own {word} {value[:9]}", {"a.kml": body.encode()}, "any")
+
+    for lat in ("nan", "inf", "1e999", "90.1", "-91", "x", "0x10", HUGE, "५०", "1_0", " "):
+        yield Case(
+            f"osm/lat {lat[:10]}",
+            {"a.osm": OSM.format(id=1, lat=lat, lon=7).encode()},
+            "any" if lat == " " else "refused",
+        )
+    for lon in ("nan", "-inf", "180.1", "1e400", HUGE):
+        yield Case(f"osm/lon {lon[:10]}", {"a.osm": OSM.format(id=1, lat=50, lon=lon).encode()}, "refused")
+    for id_ in (str(2**63), HUGE, "1.5", "x", "", "٣", "1 2", "--1", "0x1"):
+        yield Case(f"osm/id {id_[:10]}", {"a.osm": OSM.format(id=id_, lat=50, lon=7).encode()}, "refused")
+    yield Case("osm/smallest id", {"a.osm": OSM.format(id=-(2**63), lat=50, lon=7).encode()}, "read")
+    node = "<node id='1' lat='50' lon='7'/>"
+    for name, inside in {
+        "reference beyond int64": f"<way id='1'><nd ref='{2**64}'/></way>",
+        "member of no type": "<relation id='1'><member type='x' ref='1' role=''/></relation>",
+        "member beyond int64": f"<relation id='1'><member type='way' ref='{HUGE}' role=''/></relation>",
+        "unknown element": "<gpx/>",
+        "nested": "<node id='2' lat='1' lon='1'><node id='3' lat='1' lon='1'/></node>",
+        "bounds nan": "<bounds minlat='nan' minlon='0' maxlat='1' maxlon='1'/>",
+        "bounds text": "<bounds minlat='x' minlon='0' maxlat='1' maxlon='1'/>",
+        "bounds off earth": "<bounds minlat='-9000' minlon='0' maxlat='1' maxlon='1e300'/>",
+        "bounds empty": "<bounds/>",
+        "node twice": node,
+        "way of itself": "<way id='1'><nd ref='1'/><nd ref='1'/><tag k='highway' v='x'/></way>",
+        "relation of itself": "<relation id='1'><member type='relation' ref='1' role=''/></relation>",
+        "tag without key": "<way id='1'><nd ref='1'/><tag v='x'/></way>",
+    }.items():
+        for quote in "'\"":
+            body = f"<osm version='0.6'>{node}{inside}</osm>".replace("'", quote).encode()
+            refused = name.startswith(("reference", "member", "unknown"))
+            yield Case(f"osm/{name} {quote}", {"a.osm": body}, "refused" if refused else "any")
+    extract = (SAMPLES / "osm" / "quarter.osm").read_bytes()
+    yield Case("osm/gzip cut", {"a.osm.gz": gzip.compress(extract, mtime=0)[:-20]}, "refused", "osm")
+    yield Case("osm/gzip wrong sum", {"a.osm.gz": gzip.compress(extract, mtime=0)[:-8] + bytes(8)}, "refused", "osm")
+    yield Case("osm/gzip and more", {"a.osm.gz": gzip.compress(extract, mtime=0) + b"more"}, "refused", "osm")
+    yield Case("osm/gzip of nothing", {"a.osm.gz": gzip.compress(b"", mtime=0)}, "refused", "osm")
+    yield Case("osm/gzip in gzip", {"a.osm.gz": gzip.compress(gzip.compress(extract))}, "refused", "osm")
+    yield Case("osm/bzip2 cut", {"a.osm.bz2": bz2.compress(extract)[:-20]}, "refused", "osm")
+    yield Case("osm/many empty gzip streams", {"a.osm.gz": gzip.compress(b"", mtime=0) * 50_000}, "refused", "osm")
+    yield Case("osm/many empty bzip2 streams", {"a.osm.bz2": bz2.compress(b"") * 20_000}, "refused", "osm")
+
+
+def pbf_cases() -> Iterator[Case]:
+    """Blocks whose lengths and contents lie."""
+
+    def blob(kind: bytes, body: bytes, size: int | None = None) -> bytes:
+        inner = (
+            b"\x10" + varint(len(body) if size is None else size) + b"\x1a" + varint(len(z := zlib.compress(body))) + z
+        )
+        head = b"\x0a" + varint(len(kind)) + kind + b"\x18" + varint(len(inner))
+        return struct.pack(">I", len(head)) + head + inner
+
+    header = blob(b"OSMHeader", b"\x22\x0eOsmSchema-V0.6\x22\x0aDenseNodes")
+    for name, data in {
+        "header alone": header,
+        "header cut": header[:20],
+        "data of noise": header + blob(b"OSMData", b"\xff" * 100),
+        "size lie small": header + blob(b"OSMData", bytes(1000), 10),
+        "size lie large": header + blob(b"OSMData", bytes(1000), 2**31 - 1),
+        "bomb": header + blob(b"OSMData", bytes(40 * 2**20)),
+        "many bombs": header + b"".join([blob(b"OSMData", bytes(30 * 2**20))] * 40),
+        "unknown feature": blob(b"OSMHeader", b"\x22\x0fHistoricalInfos"),
+        "length of 4 GB": header + b"\xff\xff\xff\xff" + b"x" * 100,
+        "endless varint": header + blob(b"OSMData", b"\x0a" + b"\xff" * 50),
+    }.items():
+        yield Case(f"pbf/{name}", {"a.osm.pbf": data}, "any", "osm")
+    strings = b"\x0a\x02" + b"\x0a\x00"
+    dense_ids = b"".join(varint(zigzag(v)) for v in (2**62, 2**62, 2**62))
+    places = b"".join(varint(zigzag(v)) for v in (2**40, 1, 1))
+    dense = b"\x0a" + varint(len(dense_ids)) + dense_ids + b"\x42" + varint(len(places)) + places
+    dense += b"\x4a" + varint(len(places)) + places
+    group = b"\x12" + varint(len(dense)) + dense
+    yield Case(
+        "pbf/ids and places that overflow",
+        {"a.osm.pbf": header + blob(b"OSMData", strings + b"\x12" + varint(len(group)) + group)},
+        "any",
+        "osm",
+    )
+
+
+def varint(value: int) -> bytes:
+    out = b""
+    while value > 127:
+        out += bytes([value & 127 | 128])
+        value >>= 7
+    return out + bytes([value])
+
+
+def zigzag(value: int) -> int:
+    return value << 1 ^ value >> 63 & 0xFFFFFFFFFFFFFFFF
+
+
+def json_cases() -> Iterator[Case]:
+    """What JSON can do, in GeoJSON."""
+    point = '{"type": "Point", "coordinates": [7, 50]}'
+    for name, data in {
+        "brackets": b'{"type": "FeatureCollection", "features": ' + b"[" * 60_000,
+        "brackets closed": b'{"type": "FeatureCollection", "features": ' + b"[" * 900 + b"]" * 900 + b"}",
+        "objects": b'{"type": "FeatureCollection", "x": ' + b'{"a":' * 60_000,
+        "nested collections": geojson('{"type": "GeometryCollection", "geometries": [' * 300 + point + "]}" * 300),
+        "NaN": geojson('{"type": "Point", "coordinates": [NaN, 50]}'),
+        "Infinity": geojson('{"type": "Point", "coordinates": [7, Infinity]}'),
+        "1e999": geojson('{"type": "Point", "coordinates": [1e999, 50]}'),
+        "long number": geojson('{"type": "Point", "coordinates": [' + HUGE + ", 50]}"),
+        "NaN property": geojson(point, '{"a": NaN}'),
+        "1e999 property": geojson(point, '{"a": 1e999}'),
+        "long number property": geojson(point, '{"a": ' + HUGE + "}"),
+        "lone surrogate": geojson(point, '{"a": "\\ud800"}'),
+        "surrogate bytes": geojson(point, '{"a": "x"}').replace(b"x", b"\xed\xa0\x80"),
+        "off earth": geojson('{"type": "Point", "coordinates": [500000, 5000000]}'),
+        "text place": geojson('{"type": "Point", "coordinates": ["7", "50"]}'),
+        "true place": geojson('{"type": "Point", "coordinates": [true, false]}'),
+        "null place": geojson('{"type": "Point", "coordinates": [null, 50]}'),
+        "object place": geojson('{"type": "Point", "coordinates": {"lon": 7}}'),
+        "line of one": geojson('{"type": "LineString", "coordinates": [[7, 50]]}'),
+        "unknown geometry": geojson('{"type": "Circle", "coordinates": [7, 50]}'),
+        "geometry list": geojson("[7, 50]"),
+        "geometry number": geojson("7"),
+        "depth of coordinates": geojson('{"type": "Polygon", "coordinates": [7, 50]}'),
+        "ragged": geojson('{"type": "LineString", "coordinates": [[7, 50], [7]]}'),
+        "properties list": geojson(point, "[1]"),
+        "features object": b'{"type": "FeatureCollection", "features": {}}',
+        "features of numbers": b'{"type": "FeatureCollection", "features": [1, 2]}',
+        "no type": b'{"features": []}',
+        "type list": b'{"type": ["FeatureCollection"], "features": []}',
+        "array": b"[]",
+        "empty": b"{}",
+        "two documents": geojson(point) + geojson(point),
+        "cut": geojson(point)[:-5],
+        "utf-16": geojson(point).decode().encode("utf-16"),
+        "other crs": geojson(point).replace(
+            b'"features"', b'"crs": {"type": "name", "properties": {"name": "EPSG:25832"}}, "features"'
+        ),
+    }.items():
+        yield Case(f"geojson/{name}", {"a.geojson": data}, "refused", "geojson")
+    for name, data in {
+        "64 bit and one property": geojson(point, '{"a": %d}' % 2**63),
+        "70 bit property": geojson(point, '{"a": %d}' % 2**70),
+        "key twice": geojson(point, '{"a": 1, "a": 2}'),
+        "control in name": geojson(point, '{"name": "a\\u0000b\\u001b[31m"}'),
+        "bidi name": geojson(point, '{"name": "a\\u202eb"}'),
+        "id object": geojson(point, "{}", ', "id": {"a": 1}'),
+        "id long": geojson(point, "{}", ', "id": "%s"' % ("x" * 5000)),
+        "id huge": geojson(point, "{}", ', "id": 1e300'),
+        "five dimensions": geojson('{"type": "Point", "coordinates": [7, 50, 1, 2, 3]}'),
+        "empty key": geojson(point, '{"": 1}'),
+        "null key": geojson(point, '{"\\u0000": 1}'),
+        "ring of two": geojson('{"type": "Polygon", "coordinates": [[[7, 50], [8, 50]]]}'),
+        "bow tie": geojson('{"type": "Polygon", "coordinates": [[[7, 50], [8, 51], [8, 50], [7, 51], [7, 50]]]}'),
+        "altitude huge": geojson('{"type": "Point", "coordinates": [7, 50, 1e300]}'),
+    }.items():
+        yield Case(f"geojson/{name}", {"a.geojson": data}, "any")
+    for word in ("layer", "level", "part", "kind", "source", "target", "more", "drawn_from"):
+        for value in ("5", "[]", "{}", "null", '"topology"', '"' + "x" * 5000 + '"', '"a\\u0000"', '"\\n"'):
+            own = {"layer": '"topology"', "level": '"ground"', "part": '"network"', "kind": '"edge"', word: value}
+            text = "{" + ", ".join(f'"{k}": {v}' for k, v in own.items()) + "}"
+            for geometry in (point, "null"):
+                yield Case(
+                    f"geojson/own {word} {value[:9]} {geometry[:4]}",
+                    {"a.geojson": geojson(geometry, text, ', "id": "x"')},
+                    "any",
+                )
+    for said in ("5", "[]", '{"datum": 5}', '{"datum": {"latitude": 1}}', '{"datum": {"latitude": 1e5, "longitude": 0}}',
+                 '{"datum": {"latitude": "x", "longitude": []}}', '{"levels": 5}', '{"levels": [{"name": 5}]}',
+                 '{"levels": [{"x": 5}]}', '{"documents": 5}', '{"documents": [{"layer": "topology", "document": {}}]}',
+                 '{"documents": [{"layer": "topology", "level": [], "part": {}, "document": {"a": "\\u0000"}}]}',
+                 '{"levels": [{"name": "ground", "elevation": 1e300}, {"name": "ground"}]}'):  # fmt: skip
+        body = geojson(point).replace(b'"features"', f'"fleet_map": {said}, "features"'.encode())
+        yield Case(f"geojson/fleet_map {said}", {"a.geojson": body}, "any")
+
+
+def picture_cases() -> Iterator[Case]:
+    """Pictures of grids that lie, are damaged, or unfold to much."""
+    named = ROOM.replace(b"room.pgm", b"room.png")
+    rows = b"".join(b"\0" + bytes(8) for _ in range(8))
+    for name, data in {
+        "png 100000 x 100000": png(100_000, 100_000, None),
+        "png 2^31 x 2^31": png(2**31 - 1, 2**31 - 1, None),
+        "png 0 x 0": png(0, 0, rows),
+        "png 16000 x 16000 in 100 bytes": png(16_000, 16_000, None),
+        "png rows missing": png(8, 8, rows[:30]),
+        "png wrong filter": png(8, 8, b"\x09" + rows[1:]),
+        "png depth 3": png(8, 8, rows, depth=3),
+        "png colour 9": png(8, 8, rows, colour=9),
+        "png palette missing": png(8, 8, rows, colour=3),
+        "png unknown critical chunk": png(8, 8, rows, more=chunk(b"ABCD", b"x")),
+        "png wrong sum": png(8, 8, rows).replace(b"IEND\xaeB`\x82", b"IEND\0\0\0\0"),
+        "png no end": png(8, 8, rows)[:-12],
+        "png cut": png(8, 8, rows)[:-20],
+        "png no deflate": png(8, 8, rows).replace(zlib.compress(rows, 9), bytes(len(zlib.compress(rows, 9)))),
+        "png chunk of 4 GB": png(8, 8, rows)[:33] + b"\xff\xff\xff\xff" + png(8, 8, rows)[37:],
+        "jpeg cut": b"\xff\xd8\xff\xe0\x00\x10JFIF\0" + bytes(50),
+        "gif": b"GIF89a" + bytes(100),
+        "tiff": b"II*\0" + bytes(100),
+        "webp": b"RIFF\x10\0\0\0WEBPVP8 " + bytes(100),
+        "svg": b"<svg xmlns='http://www.w3.org/2000/svg'/>",
+        "empty": b"",
+        "bmp 1 GB": b"BM"
+        + struct.pack("<IHHI", 100, 0, 0, 54)
+        + struct.pack("<IiiHHIIiiII", 40, 20000, 20000, 1, 24, 0, 0, 0, 0, 0, 0),
+        "bmp negative": b"BM"
+        + struct.pack("<IHHI", 100, 0, 0, 54)
+        + struct.pack("<IiiHHIIiiII", 40, -5, -(2**31), 1, 24, 0, 0, 0, 0, 0, 0),
+        "bmp of odd header": b"BM" + bytes(50),
+    }.items():
+        yield Case(f"picture/{name}", room(named, data, "room.png"), "refused")
+    for name, data in {
+        "pgm 10 GB": b"P5 100000 100000 255\n" + bytes(900),
+        "pgm 2^62": b"P5 2147483647 2147483647 255\n",
+        "pgm huge numbers": b"P5 " + b"9" * 5000 + b" 1 255\n",
+        "pgm 0 x 5": b"P5 0 5 255\n",
+        "pgm negative": b"P5 -4 3 255\n" + bytes(12),
+        "pgm highest 0": b"P5 4 3 0\n" + bytes(12),
+        "pgm highest 65536": b"P5 4 3 65536\n" + bytes(24),
+        "pgm cut": PGM[:-1],
+        "pgm header cut": b"P5 4 3",
+        "pgm endless comment": b"P5 #" + b"x" * 100_000,
+        "pgm text in numbers": b"P5 4x 3 255\n" + bytes(12),
+        "plain pgm too few": b"P2 4 3 255\n1 2 3",
+        "plain pgm long number": b"P2 2 1 255\n1 " + b"9" * 5000,
+        "plain pgm letters": b"P2 2 1 255\n1 x",
+        "plain pgm negative": b"P2 2 1 255\n1 -2",
+        "plain pgm above highest": b"P2 2 1 255\n1 300",
+        "ppm 10 GB": b"P6 60000 60000 255\n" + bytes(900),
+        "ppm 16 bit cut": b"P6 16000 16000 65535\n" + bytes(900),
+        "pbm 10 GB": b"P4 300000 300000\n" + bytes(900),
+        "pfm": b"Pf 4 3 -1.0\n" + bytes(48),
+        "pam": b"P7\nWIDTH 4\nHEIGHT 3\nDEPTH 1\nMAXVAL 255\nENDHDR\n" + bytes(12),
+        "yaml as picture": ROOM,
+    }.items():
+        yield Case(f"picture/{name}", room(ROOM, data), "refused")
+    for name, data in {
+        "png 16 bit": png(4, 2, b"".join(b"\0" + bytes(8) for _ in range(2)), depth=16),
+        "png grey and alpha": png(4, 2, b"".join(b"\0" + bytes(8) for _ in range(2)), colour=4),
+        "png palette": png(8, 8, rows, colour=3, more=chunk(b"PLTE", bytes(768)) + chunk(b"tRNS", bytes(256))),
+        "png short palette": png(8, 2, (b"\0" + b"\xff" * 8) * 2, colour=3, more=chunk(b"PLTE", bytes(3))),
+        "png long palette": png(8, 8, rows, colour=3, more=chunk(b"PLTE", bytes(3000))),
+        "png odd palette": png(8, 8, rows, colour=3, more=chunk(b"PLTE", bytes(7))),
+        "png two headers": png(8, 8, rows, more=chunk(b"IHDR", struct.pack(">IIBBBBB", 2**20, 2**20, 8, 0, 0, 0, 0))),
+        "png text bomb": png(8, 8, rows, more=chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(50 * 2**20)))),
+        "png profile bomb": png(8, 8, rows, more=chunk(b"iCCP", b"a\0\0" + zlib.compress(bytes(50 * 2**20)))),
+        "png animation": png(8, 8, rows, more=chunk(b"acTL", struct.pack(">II", 2**31 - 1, 0))),
+        "png more behind": png(8, 8, rows) + bytes(1000),
+        "png more rows": png(8, 8, rows * 50),
+        "png 8000 x 8000 of nothing": png(8000, 8000, bytes(8001 * 8000)),
+    }.items():
+        yield Case(f"picture/{name}", room(named, data, "room.png"), "any")
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.effect_noise((64, 64), 50).save(out, "JPEG", progressive=True)
+    jpeg = out.getvalue()
+    scan = jpeg.rfind(b"\xff\xda")
+    end = jpeg.rfind(b"\xff\xd9")
+    many = jpeg[:end] + jpeg[scan:end] * 200 + jpeg[end:]
+    yield Case("picture/jpeg of 200 scans", room(ROOM.replace(b"room.pgm", b"room.jpg"), many, "room.jpg"), "refused")
+    size = jpeg.find(b"\xff\xc2")
+    large = jpeg[: size + 5] + struct.pack(">HH", 65_500, 65_500) + jpeg[size + 9 :]
+    yield Case("picture/jpeg 4 GB", room(ROOM.replace(b"room.pgm", b"room.jpg"), large, "room.jpg"), "refused")
+
+
+def archive_cases() -> Iterator[Case]:
+    """Archives that escape, lie or unfold; as a folder and as a KMZ."""
+    doc = KML.format(name="x", at="7,50").encode()
+    body = b"x" * 100
+    plain = (b"doc.kml", doc, {})
+    local = len(b"doc.kml") + 30 + len(doc)
+    for name, data in {
+        "slip": raw_zip([plain, (b"../../evil.kml", body, {})]),
+        "absolute": raw_zip([plain, (b"/etc/evil", body, {})]),
+        "backslash": raw_zip([plain, (b"..\\evil", body, {})]),
+        "drive": raw_zip([plain, (b"C:/evil", body, {})]),
+        "dot folder": raw_zip([plain, (b"a/./b", body, {})]),
+        "null in name": raw_zip([plain, (b"a\0b", body, {})]),
+        "newline in name": raw_zip([plain, (b"a\nb", body, {})]),
+        "empty name": raw_zip([plain, (b"", body, {})]),
+        "bad utf-8": raw_zip([plain, (b"\xff\xfe", body, {})]),
+        "name of 60 kB": raw_zip([plain, (b"x" * 60_000, body, {})]),
+        "symlink": raw_zip([plain, (b"link", b"/etc/passwd", {"mode": 0o120777})]),
+        "device": raw_zip([plain, (b"dev", b"", {"mode": 0o020666})]),
+        "pipe": raw_zip([plain, (b"fifo", b"", {"mode": 0o010666})]),
+        "encrypted": raw_zip([plain, (b"secret", body, {"flags": 0x801})]),
+        "method 99": raw_zip([plain, (b"odd", body, {"method": 99})]),
+        "name twice": raw_zip([plain, plain]),
+        "names by case": raw_zip([plain, (b"DOC.KML", doc, {})]),
+        "names by normal form": raw_zip([plain, ("ä".encode(), body, {}), ("a\u0308".encode(), body, {})]),
+        "file and folder": raw_zip([plain, (b"a", body, {}), (b"a/b", body, {})]),
+        "overlap": raw_zip([plain, (b"doc.kml", doc, {"start": 0}), (b"b.kml", doc, {})]),
+        "wrong sum": raw_zip([(b"doc.kml", doc, {"crc": 1})]),
+        "sizes disagree": raw_zip([(b"doc.kml", doc, {"central_size": 5})]),
+        "start beyond": raw_zip([(b"doc.kml", doc, {"start": 2**31})]),
+        "start at end": raw_zip([(b"doc.kml", doc, {"start": local - 4})]),
+        "declares 4 GB": raw_zip([(b"doc.kml", doc, {"size": 2**32 - 2})]),
+        "zip64 mark without field": raw_zip([(b"doc.kml", doc, {"size": 2**32 - 1, "packed": 2**32 - 1})]),
+        "cut": zipped({"doc.kml": doc})[:-10],
+        "nothing": b"PK\5\6" + bytes(18),
+        "only a head": b"PK\3\4",
+        "many ends": zipped({"doc.kml": doc}) + b"PK\5\6" * 10_000,
+        "count lie": zipped({"doc.kml": doc})[:-12] + b"\xff\xff" + zipped({"doc.kml": doc})[-10:],
+        "11000 members": zipped({f"f{k}": b"" for k in range(11_000)}),
+        "real bomb": zipped({"doc.kml": doc, **{f"z{k}": bytes(64 * 2**20) for k in range(17)}}),
+    }.items():
+        verdict: Verdict = "refused"
+        yield Case(f"kmz/{name}", {"a.kmz": data}, verdict, "kmz")
+        yield Case(f"zip/{name}", {"a.zip": data}, verdict)
+    yield Case("kmz/no kml", {"a.kmz": zipped({"a.txt": body})}, "refused", "kmz")
+    inner = zipped({"doc.kml": doc})
+    for _ in range(20):
+        inner = zipped({"a.zip": inner})
+    yield Case("zip/zip in zip in zip", {"a.zip": inner}, "refused")
+    yield Case("kmz/zip in it", {"a.kmz": zipped({"doc.kml": doc, "a.zip": inner})}, "read")
+    yield Case("kmz/kmz in it", {"a.kmz": zipped({"doc.kml": doc, "b.kmz": zipped({"doc.kml": doc})})}, "read")
+    yield Case("zip/two say the same name", {"a.zip": zipped({"b.kml": doc}), "b.kml": doc}, "refused")
+    yield Case("zip/many bombs", {f"{k}.zip": zipped({f"{k}/z": bytes(200 * 2**20)}) for k in range(8)}, "refused")
+    link = "<kml><GroundOverlay><Icon><href>{}</href></Icon></GroundOverlay></kml>"
+    for href in ("../../../etc/passwd", "files/%2e%2e/%2e%2e/x.png", "doc.kml", "files/x.png"):
+        files = {"doc.kml": link.format(href).encode(), "files/x.png": png(2**31 - 1, 2**31 - 1, None)}
+        yield Case(f"kmz/href {href[:16]}", {"a.kmz": zipped(files)}, "any")
+
+
+def folder_cases() -> Iterator[Case]:
+    """Folders as robots have them, with scripts."""
+    datum = {"config/location/datum.yaml": DATUM.format(lat=53.0, lon=-0.5).encode()}
+    scripts = {
+        "command": b"export A=$(touch /tmp/evil)\nexport B=`id`\nC=1\n",
+        "endless quote": b"export A='" + b"x" * 1_000_000,
+        "many lines": b"export A=1\n" * 200_000,
+        "backslashes": b"A=" + b"\\" * 1_000_000,
+        "null": b"A=\0\n",
+        "not text": bytes(range(256)) * 100,
+        "dollar quotes": b"A=$'\\x41'\nB=${C:-x}\nD=$((1+1))\n",
+        "here document": b"cat <<E\nA=1\nE\n",
+    }
+    for name, script in scripts.items():
+        for file in ("properties.sh", "environment.sh"):
+            yield Case(f"folder/{name} {file}", {**datum, file: script}, "any")
+    for folder in ("location", "metric", "topological", "world"):
+        yield Case(f"folder/noise in {folder}", {**datum, f"config/{folder}/a.yaml": bytes(range(256))}, "any")
+        yield Case(f"folder/kml in {folder}", {**datum, f"config/{folder}/a.kml": b"<kml>"}, "refused")
+    yield Case("folder/nothing in it", {"a.zip": zipped({})}, "refused")
+    yield Case("folder/empty files", {"datum.yaml": b"", "a.kml": b""}, "refused")
+    noise = random.Random(1).randbytes(20_000)
+    for name in ("a.yaml", "a.osm", "a.kml", "a.kmz", "a.geojson", "a.pgm", "a.tmap2.yaml", "datum.yaml", "a.zip", "a"):
+        yield Case(f"noise/{name}", {name: noise}, "refused")
+
+
+ACCORDING_TO_KIND = (yaml_cases, xml_cases, pbf_cases, json_cases, picture_cases, archive_cases, folder_cases)
+
+
+def cases() -> list[Case]:
+    """All of them."""
+    return [case for kind in ACCORDING_TO_KIND for case in kind()]
+
+
+# --- damage ------------------------------------------------------------------------------------------------------
+
+VALUES = (
+    b"nan", b".nan", b"-.inf", b"1e999", b"9" * 5000, b"18446744073709551616", b"-1", b"0", b"true", b"null", b"[]", b"{}",
+    b"''", b'""', b"\xed\xa0\x80", b"\0", b"&", b"<", b"*a", b"&a", b"\xe2\x80\xae", b"91", b"-181", b"[" * 500, b"{" * 500,
+)  # fmt: skip
+
+
+def damaged(data: bytes, seed: int, count: int) -> Iterator[bytes]:
+    """So many damaged copies: cut, flipped, doubled, with other values, with lines that moved."""
+    dice = random.Random(seed)
+    for k in range(count):
+        kind = k % 6
+        if kind == 0:
+            yield data[: dice.randrange(len(data))]
+        elif kind == 1:
+            flipped = bytearray(data)
+            for _ in range(dice.choice([1, 1, 3, 20])):
+                flipped[dice.randrange(len(flipped))] ^= 1 << dice.randrange(8)
+            yield bytes(flipped)
+        elif kind == 2:
+            a, b = sorted(dice.sample(range(len(data) + 1), 2))
+            yield data[:a] + data[b:] if dice.random() < 0.5 else data[:b] + data[a:b] + data[b:]
+        elif kind == 3:
+            start = dice.randrange(len(data))
+            digits = [j for j in range(start, len(data)) if 48 <= data[j] <= 57] or [start]
+            a = b = digits[0]
+            while b < len(data) and data[b] in b"0123456789.":
+                b += 1
+            yield data[:a] + dice.choice(VALUES) + data[b:]
+        elif kind == 4:
+            at = dice.randrange(len(data))
+            yield data[:at] + dice.choice(VALUES) + data[at:]
+        else:
+            lines = data.split(b"\n")
+            a, b = dice.randrange(len(lines)), dice.randrange(len(lines))
+            lines[a], lines[b] = lines[b], lines[a]
+            yield b"\n".join(lines)
+
+
+def sample_maps() -> list[tuple[str, dict[str, bytes]]]:
+    """(format, files) of each of our own samples."""
+    out = []
+    for folder in sorted(SAMPLES.iterdir()):
+        for item in sorted(folder.iterdir()):
+            if item.is_dir():
+                out.append(
+                    (folder.name, {p.name: p.read_bytes() for p in sorted(item.iterdir()) if p.suffix != ".json"})
+                )
+            elif not item.name.endswith("facts.json"):
+                out.append((folder.name, {item.name: item.read_bytes()}))
+    return out

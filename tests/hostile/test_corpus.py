@@ -1,0 +1,96 @@
+"""Hostile files through the read boundary: refused with file and reason, or read; no crash, no hang, little memory."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Iterator
+
+import orjson
+import pytest
+
+from app import bundle
+from app.bundle import Hints, Known
+from app.errors import BadUpload, Invalid, TooLarge
+from app.formats import Limits
+from app.formats._text import numbers
+from tests.hostile.corpus import ACCORDING_TO_KIND, Case, cases, damaged, sample_maps, zipped
+
+SECONDS = 15.0
+"""For one case, on a slow machine; the slowest ones take one or two."""
+
+MEMORY = 6 * 2**30
+COPIES = 60
+
+LIMITS = Limits()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def little_memory() -> Iterator[None]:
+    """An address space like a worker's: what would eat more fails here instead of the machine."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def outcome(case: Case) -> str:
+    """``read`` or ``refused``; anything else fails here."""
+    start = time.monotonic()
+    try:
+        told = bundle.read(bundle.unpack(case.files, LIMITS), Hints(case.format), Known(), LIMITS)
+    except (BadUpload, Invalid) as error:
+        result = "refused"
+        assert error.detail
+        assert "Traceback" not in error.detail
+        if isinstance(error, BadUpload):
+            assert error.problems, f"{case.name}: refused without a place: {error.detail}"
+            assert all(p.file and p.problem for p in error.problems), f"{case.name}: which file? {error.detail}"
+    else:
+        result = "read"
+        # What was read can be answered as JSON: no NaN, no integer beyond 64 bit, no lone surrogate.
+        for part in told.parts.values():
+            orjson.dumps([list(getattr(part, "ids", ())), list(getattr(part, "properties", ()))])
+        orjson.dumps([w.as_dict() for w in told.warnings])
+    assert time.monotonic() - start < SECONDS, f"{case.name} takes too long"
+    return result
+
+
+@pytest.mark.parametrize("kind", ACCORDING_TO_KIND, ids=lambda kind: kind.__name__)
+def test_hostile_files(kind: object) -> None:
+    wrong = []
+    for case in kind():  # type: ignore[operator]
+        result = outcome(case)
+        if case.verdict not in ("any", result):
+            wrong.append(f"{case.name}: {result}, not {case.verdict}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_case_has_a_name_of_its_own() -> None:
+    names = [case.name for case in cases()]
+    assert len(names) > 700
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize(("name", "files"), [pytest.param(n, f, id=f"{n}/{min(f)}") for n, f in sample_maps()])
+def test_damaged_samples(name: str, files: dict[str, bytes]) -> None:
+    results = set()
+    for victim in sorted(files):
+        for k, data in enumerate(damaged(files[victim], seed=len(files[victim]), count=COPIES)):
+            case = Case(f"{victim}, damage {k}", {**files, victim: data}, "any", name if k % 2 else None)
+            results.add(outcome(case))
+    assert "refused" in results, "no damage at all is noticed"
+
+
+def test_archives_of_one_upload_share_the_limit() -> None:
+    limits = Limits(unpacked_bytes=3000)
+    files = {f"{k}.zip": zipped({f"{k}/z": bytes(1000)}) for k in range(3)}
+    assert len(bundle.unpack(files, limits)) == 3
+    with pytest.raises(TooLarge) as caught:
+        bundle.unpack({**files, "one more.zip": zipped({"a": b"1"})}, limits)
+    assert [p.file for p in caught.value.problems] == ["one more.zip"]
+
+
+def test_large_numbers_keep_their_digits() -> None:
+    values = [1e300, -1e300, 2.0**53, 1.23456789012345, -0.0]
+    assert numbers(values) == ["1e+300", "-1e+300", "9007199254740992.0", "1.23456789", "0.0"]

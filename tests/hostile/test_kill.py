@@ -1,0 +1,149 @@
+"""kill -9 of the server while uploads arrive: what was acknowledged is there byte for byte, else nothing or all."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import random
+import signal
+import sqlite3
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.cli.conftest import ServerProcess
+
+TOKEN = "administrator-of-the-tests"
+HEADERS = {"Authorization": f"Bearer {TOKEN}"}
+ENVIRONMENT = "/api/v1/environments/farm"
+KILLS = 3
+SENDERS = 3
+HEALTHY_SECONDS = 5.0
+ROOM = (
+    b"image: room.pgm\nresolution: 0.1\norigin: [0.0, 0.0, 0.0]\n"
+    b"negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\nnote: %d\n"
+)
+
+Files = dict[str, bytes]
+
+
+@dataclass
+class Ledger:
+    """What was sent, by the hashes of its files, and which versions the server acknowledged."""
+
+    sent: dict[frozenset[tuple[str, str]], Files] = field(default_factory=dict)
+    acknowledged: dict[int, Files] = field(default_factory=dict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+
+def digests(files: Files) -> frozenset[tuple[str, str]]:
+    return frozenset((name, hashlib.sha256(data).hexdigest()) for name, data in files.items())
+
+
+def upload_until_dead(address: str, ledger: Ledger, dice: random.Random) -> None:
+    """One grid after another, some of them large, until the server is gone."""
+    with httpx.Client(base_url=address, headers=HEADERS, timeout=20) as client, contextlib.suppress(httpx.HTTPError):
+        while True:
+            width, height = dice.randint(10, 900), dice.randint(10, 900)
+            pixels = bytes(dice.choices((0, 205, 254), k=width)) * height
+            files = {
+                "room.yaml": ROOM % dice.randrange(10**12),
+                "room.pgm": b"P5 %d %d 255\n" % (width, height) + pixels,
+            }
+            with ledger.lock:
+                ledger.sent[digests(files)] = files
+            answer = client.post(f"{ENVIRONMENT}/versions", files=[("files", (n, d)) for n, d in files.items()])
+            assert answer.status_code in (201, 503), answer.text
+            if answer.status_code == 201:
+                with ledger.lock:
+                    ledger.acknowledged[answer.json()["version"]] = files
+
+
+@contextlib.contextmanager
+def serving(folder: Path, starts: list[float]) -> Iterator[tuple[ServerProcess, str]]:
+    """A started server and its address; ``starts`` gets the seconds until it was healthy."""
+    start = time.monotonic()
+    process = ServerProcess(
+        "--data-dir", str(folder / "data"), environment={"FLEETMAP_ADMIN_TOKEN": TOKEN}, folder=folder
+    )
+    try:
+        address = process.address
+        while True:
+            with contextlib.suppress(httpx.HTTPError):
+                if httpx.get(f"{address}/healthz", timeout=1).status_code == 200:
+                    break
+            assert time.monotonic() - start < 60, "the server does not come up"
+            time.sleep(0.02)
+        starts.append(time.monotonic() - start)
+        process.ready()
+        yield process, address
+    finally:
+        process.stop(signal.SIGKILL)
+
+
+def check(folder: Path, address: str, ledger: Ledger) -> int:
+    """The invariants after a fault; the number of versions."""
+    with httpx.Client(base_url=address, headers=HEADERS, timeout=20) as client:
+        head = client.get(ENVIRONMENT).json()["version"]
+        versions = client.get(f"{ENVIRONMENT}/versions", params={"limit": 1000}).json()
+        assert [v["version"] for v in versions] == list(range(head, -1, -1)), "a gap, a fork or a number used twice"
+        assert set(ledger.acknowledged) <= set(range(1, head + 1))
+        for version in versions[:-1]:
+            number = version["version"]
+            place = f"{ENVIRONMENT}/versions/{number}"
+            listed = client.get(f"{place}/sources").json()
+            told = frozenset((s["name"], s["sha256"]) for s in listed)
+            assert told in ledger.sent, f"version {number} is not one of the uploads"
+            expected = ledger.acknowledged.get(number, ledger.sent[told])
+            assert told == digests(expected)
+            for name, data in expected.items():
+                assert client.get(f"{place}/sources/{name}").content == data
+            assert client.get(f"{place}/layers/occupancy", params={"name": "room"}).status_code == 200
+        if head:
+            assert client.get(f"{ENVIRONMENT}/versions/latest/maps/occupancy_grid").status_code == 200
+    with contextlib.closing(sqlite3.connect(folder / "data" / "fleetmap.sqlite3")) as database:
+        assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+    left = [p for p in (folder / "data" / "blobs" / "tmp").iterdir() if p.name != ".lock"]
+    assert not left, "temporary files of the killed server are still there"
+    spools = list((folder / "data" / "spool").iterdir())
+    assert len(spools) == 1, "the spool of the killed server is still there"
+    assert [p.name for p in spools[0].iterdir()] == ["alive"]
+    return int(head)
+
+
+@pytest.mark.parametrize("seed", [1])
+def test_kill_9_while_uploads_arrive(tmp_path: Path, seed: int) -> None:
+    dice = random.Random(seed)
+    ledger = Ledger()
+    starts: list[float] = []
+    with serving(tmp_path, starts) as (_, address):
+        assert httpx.post(f"{address}/api/v1/environments", json={"name": "farm"}, headers=HEADERS).status_code == 201
+    heads = [0]
+    for _ in range(KILLS):
+        with serving(tmp_path, starts) as (process, address):
+            heads.append(check(tmp_path, address, ledger))
+            senders = [
+                threading.Thread(target=upload_until_dead, args=(address, ledger, random.Random(dice.random())))
+                for _ in range(SENDERS)
+            ]
+            for sender in senders:
+                sender.start()
+            before, deadline = len(ledger.acknowledged), time.monotonic() + 30
+            while len(ledger.acknowledged) == before and time.monotonic() < deadline:
+                time.sleep(0.005)  # its first upload takes long: workers start
+            time.sleep(dice.uniform(0.0, 0.6))
+            process.process.send_signal(signal.SIGKILL)
+            for sender in senders:
+                sender.join(30)
+                assert not sender.is_alive()
+    with serving(tmp_path, starts) as (_, address):
+        heads.append(check(tmp_path, address, ledger))
+    assert heads == sorted(heads)
+    # The first start also makes the database, so on a machine busy with other things it says what a start takes here.
+    assert max(starts[1:]) < max(HEALTHY_SECONDS, 2 * starts[0])
+    assert ledger.acknowledged, "nothing was acknowledged: this test tested nothing"

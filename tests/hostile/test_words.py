@@ -1,0 +1,130 @@
+"""Words that mean something to us, with values of any type: edits and GeoJSON can bring them, no writer may stumble."""
+
+# ruff: noqa: E501 - lists of values
+
+from __future__ import annotations
+
+import random
+import traceback
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pytest
+import shapely
+
+from app import bundle, formats
+from app.bundle import Hints, Known
+from app.convert.make import write
+from app.convert.recipe import Stock, chain
+from app.errors import FleetMapError
+from app.formats import Limits
+from app.model.features import NO_GEOMETRY, Features
+from app.model.frame import Datum
+from app.model.layers import Layers
+from tests.hostile.corpus import sample_maps
+
+HERE = Datum(50.0, 7.0, heading=30.0)
+VALUES: tuple[Any, ...] = (
+    None, True, 0, -5, 2**63 - 1, 1.5, -1e300, 1e300, "", "x", "50", "nan", "\u202e\u200b", "a\nb", "\0", "]]>", "<&>", "-->", [], {},
+    [None], [[]], [1, 2, 3], ["a"], [{}], [[1.0, 2.0]], {"a": 1}, {"": {}}, {"name": []}, {"type": []}, {"a:b c": "<"}, [["a", "b", "c"]],
+)  # fmt: skip
+SHAPES = (
+    NO_GEOMETRY,
+    shapely.Point(),
+    shapely.Point(7.001, 50.001),
+    shapely.Point(7.001, 50.001, 3.0),
+    shapely.LineString([(7.0, 50.0), (7.001, 50.001)]),
+    shapely.LineString([(7.0, 50.0), (7.0, 50.0)]),
+    shapely.LinearRing([(7.0, 50.0), (7.001, 50.0), (7.001, 50.001)]),
+    shapely.Polygon([(7.0, 50.0), (7.001, 50.0), (7.001, 50.001)]),
+    shapely.Polygon(),
+    shapely.MultiPoint([(7.0, 50.0), (7.001, 50.001)]),
+    shapely.GeometryCollection([shapely.Point(7.0, 50.0), shapely.LineString([(7.0, 50.0), (7.001, 50.001)])]),
+)
+WORDS = (
+    "kind", "name", "source", "target", "orientation", "action", "speed_limit", "width", "drawn_from", "oneway", "tags",
+    "value", "expires", "pose", "size", "datum", "bounds", "attribution", "data", "style", "layer", "level", "part", "more",
+    *formats.all_formats(),
+)  # fmt: skip
+ROUNDS = 150
+FOR_EACH = 6
+
+
+def other(value: Any, dice: random.Random) -> Any:
+    """The value with one place in it changed, taken away or added."""
+    if isinstance(value, Mapping):
+        out = dict(value)
+        key = dice.choice([*out, dice.choice(WORDS)]) if out else dice.choice(WORDS)
+        if key in out and dice.random() < 0.15:
+            del out[key]
+        elif key in out and dice.random() < 0.6:
+            out[key] = other(out[key], dice)
+        else:
+            out[key] = dice.choice(VALUES)
+        return out
+    if isinstance(value, list) and value and dice.random() < 0.7:
+        rows = list(value)
+        at = dice.randrange(len(rows))
+        rows[at] = other(rows[at], dice)
+        return rows if dice.random() < 0.8 else rows[:at]
+    return dice.choice(VALUES)
+
+
+def changed(part: Features, dice: random.Random) -> Features:
+    """One feature, or the document, with something else in it."""
+    geometry, properties, local = part.geometry.copy(), list(part.properties), part.local.copy()
+    document = part.document
+    kind = dice.random()
+    if kind < 0.2 or not len(part):
+        document = other(document, dice)
+    else:
+        k = dice.randrange(len(part))
+        if kind < 0.8:
+            properties[k] = other(properties[k], dice)
+        else:
+            geometry[k] = dice.choice(SHAPES)
+            local[k] = dice.random() < 0.5
+    return Features(part.ids, geometry, tuple(properties), local, document)
+
+
+def bases() -> Iterator[tuple[str, Layers]]:
+    for name, files in sample_maps():
+        for layer in (None, "topology"):
+            if layer and not formats.get_format(name).drawing:
+                continue
+            told = bundle.read(bundle.unpack(files, Limits()), Hints(name, layer=layer), Known(HERE), Limits())
+            yield f"{name}/{min(files)}{f' as {layer}' if layer else ''}", told.layers(HERE)
+
+
+def bugs(layers: Layers) -> list[tuple[str, BaseException]]:
+    """Of writing every format: exceptions that nobody could tell a user."""
+    out: list[tuple[str, BaseException]] = []
+    stock = Stock(frozenset(layers.parts), layers.datum is not None)
+    for name, known in formats.all_formats().items():
+        try:
+            written = write(known, layers, {}, chain(known, stock, known.write_options()))
+        except FleetMapError as error:
+            assert error.detail
+        except Exception as error:  # noqa: BLE001  all of them are what is looked for
+            out.append((name, error))
+        else:
+            assert all(isinstance(data, bytes) for data in written.files.values())
+    return out
+
+
+@pytest.mark.parametrize("layers", [pytest.param(layers, id=name) for name, layers in bases()])
+def test_no_value_of_a_word_breaks_a_writer(layers: Layers) -> None:
+    vector = [key for key, part in layers.parts.items() if isinstance(part, Features)]
+    if not vector:
+        return
+    found: dict[str, str] = {}
+    for seed in range(ROUNDS):
+        dice = random.Random(seed)
+        parts = dict(layers.parts)
+        for _ in range(dice.randint(1, FOR_EACH)):
+            key = dice.choice(vector)
+            parts[key] = changed(parts[key], dice)  # type: ignore[arg-type]
+        for name, error in bugs(Layers(parts, layers.datum, layers.levels)):
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            found.setdefault(f"{name}: {type(error).__name__} {place.filename}:{place.lineno}", f"{error}"[:200])
+    assert not found, "\n".join(f"{place}  {text}" for place, text in sorted(found.items()))
