@@ -1,0 +1,67 @@
+"""Requests that are JSON and still nonsense: told as a problem, nothing stored."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.api.conftest import Api, running, settings_for
+from tests.hostile.corpus import room
+
+CELLS = {"op": "cells", "grid": "room", "crs": "local", "value": 100}
+
+
+@pytest.fixture(scope="module")
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
+    folder: Path = tmp_path_factory.mktemp("server")
+    with running(settings_for(folder)) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", room())
+        yield api
+
+
+@pytest.mark.parametrize("time", ["9999-12-31T23:59:59-23:59", "0001-01-01T00:00:00+23:59"])
+def test_times_that_leave_the_calendar(api: Api, time: str) -> None:
+    api.problem("PUT", "environments/farm/channels/staging", 422, json={"version": 1, "activate_at": time})
+    api.problem("POST", "tokens", 422, json={"name": "a", "role": "viewer", "expires": time})
+
+
+@pytest.mark.parametrize(
+    "ring",
+    [
+        [[0, 0], [1e308, 0], [5, 5], [0, 0]],
+        [[-1e300, -1e300], [1e300, -1e300], [0, 1e300], [-1e300, -1e300]],
+        [],
+    ],
+)
+def test_cells_of_a_polygon_beyond_all_bounds(api: Api, ring: Any) -> None:
+    change = {**CELLS, "polygon": {"type": "Polygon", "coordinates": [ring] if ring else []}}
+    api.problem("POST", "environments/farm/edits", 422, json={"message": "", "changes": [change]})
+    assert api.get("environments/farm").json()["version"] == 1
+
+
+def test_a_search_for_what_no_database_holds(api: Api) -> None:
+    api.problem("GET", "environments?q=%00", 422)
+
+
+@pytest.mark.parametrize("origin", [[], {}, 5, None, True])
+def test_words_of_another_type_that_an_edit_brings(api: Api, origin: Any) -> None:
+    api.post("environments", {"name": "odd", "datum": {"latitude": 50.0, "longitude": 7.0}})
+    try:
+        node = {
+            "type": "Feature",
+            "id": "n",
+            "geometry": {"type": "Point", "coordinates": [7.0, 50.0]},
+            "properties": {"kind": "node", "drawn_from": origin, "name": origin, "orientation": origin},
+        }
+        change = {"op": "put", "layer": "topology", "feature": node}
+        api.post("environments/odd/edits", {"message": "", "changes": [change]})
+        for name in ("kml", "kmz", "geojson", "osm", "tmap2"):
+            answer = api.get(f"environments/odd/versions/latest/maps/{name}", None)
+            assert answer.status_code < 500, f"{name}: {answer.text}"
+    finally:
+        api("DELETE", "environments/odd")
+        api("POST", "environments/odd/purge")
