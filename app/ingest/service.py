@@ -29,6 +29,9 @@ Run = Callable[..., Any]
 UNCHANGED = "="
 """Before the fingerprint of a request that changed nothing."""
 
+MAX_DEPTH = 128
+"""Of an edit's lists and objects: as deep as GeoJSON files may be, and well within what can be written again."""
+
 TRIES = 50
 """How often a change without ``If-Match`` is brought onto a head that has moved meanwhile."""
 
@@ -125,6 +128,9 @@ class Ingest:
         idempotency: str | None = None,
     ) -> Outcome:
         """The contract's edits -> one version. Raises Invalid (dangling edges, unknown ids), StaleParent, Conflict."""
+        if _deeper_than(MAX_DEPTH, changes):
+            reason = f"nested deeper than {MAX_DEPTH} lists and objects"
+            raise Invalid(f"the changes are {reason}", [Problem(reason, where="changes")])
         key = _idempotency(idempotency, _digest(["edit", list(changes), message]))
         replayed = self._replayed(environment, key)
         if replayed is not None:
@@ -360,6 +366,21 @@ def _fingerprint(upload: Upload) -> str:
     said = [upload.format, upload.layer, upload.level, upload.grid, upload.mode, upload.message, upload.dry_run]
     files = sorted([f.name, f.sha256] for f in upload.files)
     return _digest(["upload", said, dict(sorted(upload.options.items())), files])
+
+
+def _deeper_than(most: int, value: Any) -> bool:
+    """Whether lists and mappings lie in one another more often than this."""
+    front = [value]
+    for _ in range(most):
+        front = [
+            inner
+            for one in front
+            if isinstance(one, list | tuple | Mapping)
+            for inner in (one.values() if isinstance(one, Mapping) else one)
+        ]
+        if not front:
+            return False
+    return True
 
 
 def _digest(value: Any) -> str:

@@ -65,3 +65,15 @@ def test_words_of_another_type_that_an_edit_brings(api: Api, origin: Any) -> Non
     finally:
         api("DELETE", "environments/odd")
         api("POST", "environments/odd/purge")
+
+
+def test_an_edit_that_is_nested_deeply(api: Api) -> None:
+    value: Any = 1
+    for _ in range(400):
+        value = [value]
+    point = {"type": "Point", "coordinates": [0, 0]}
+    feature = {"type": "Feature", "id": "d", "geometry": point, "properties": {"x": value}}
+    change = {"op": "put", "layer": "objects", "crs": "local", "feature": feature}
+    found = api.problem("POST", "environments/farm/edits", 422, json={"message": "", "changes": [change]})
+    assert "nested" in found["detail"]
+    assert api.get("environments/farm").json()["version"] == 1
