@@ -23,6 +23,7 @@ KINDS = {
     "kmz": "kmz",
     "osm_xml": "osm",
     "occupancy_map_yaml": "occupancy_grid",
+    "openrmf_building": "openrmf",
 }
 
 REFUSED = {

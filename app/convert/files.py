@@ -46,7 +46,7 @@ def offline(
     limits = limits or Limits()
     unpacked = bundle.unpack(files, limits)
     hints = hints or Hints()
-    needed: frozenset[Layer] = frozenset().union(*known.needs.one_of)
+    needed: frozenset[Layer] = known.needs.also.union(*known.needs.one_of)
     wanted = None if "objects" in needed else needed  # whatever can be read can be an object
     told = bundle.read(unpacked, hints, Known(datum, None, wanted, not known.outlines, known.drawing), limits)
     layers = told.layers(datum)

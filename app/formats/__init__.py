@@ -119,11 +119,13 @@ class Needs:
 
     one_of: alternatives, the first that is complete is enough; every carried layer that is there is written.
     anchor: the coordinates the format speaks, so that items anchored otherwise need a datum. datum: needed always.
+    also: layers of which the writer uses a part where they are there, and does without where they are not.
     """
 
     one_of: tuple[frozenset[Layer], ...]
     anchor: Anchor | None = None
     datum: bool = False
+    also: frozenset[Layer] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)

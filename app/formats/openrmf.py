@@ -1,0 +1,1245 @@
+"""building.yaml: the buildings of Open-RMF's traffic editor, with the floor plan images that they name.
+
+A level has vertices ``[x, y, z, name, {parameters}]``; lanes, walls, doors, measurements and human lanes are
+``[i, j, {parameters}]`` between vertices, floors and holes rings of them; a parameter is ``[type, value]`` with 1 text,
+2 integer, 3 decimal, 4 truth value. What the numbers mean, ``coordinate_system`` says:
+
+* ``reference_image`` (also where the key is absent): pixels, y down. y is negated; the scale is the mean of metres per
+  pixel over the measurements of the reference level (``reference_level_name``, else the first); every other level takes
+  scale, turn and shift from the fiducials that it shares by name with the reference level, never from its own
+  measurements. Without two of them (without measurements) a pixel counts as a metre.
+* ``cartesian_meters``: metres, y up; ``offset_x`` and ``offset_y`` are told and not applied.
+* ``wgs84``: x is the longitude, y the latitude, degrees.
+* ``web_mercator``: the world is 256 wide; x from 0 eastward, y from 0 downward to -256.
+
+Source: open-rmf/rmf_traffic_editor, rmf_building_map_tools/building_map (building.py, level.py, transform.py, lift.py).
+
+Canonical: one part of topology and one of objects for each level. A vertex is a node, called by its name, else
+``<level>/<index>``; a lane is an edge, a two-way one two edges that come back as one lane. Walls, doors, floors, holes,
+models, lifts, fiducials, measurements and human lanes are objects of these kinds. ``properties.openrmf`` keeps an
+item's place in its list (``index``), its ``parameters``, and the ``vertices`` that it stood on. The document's
+``openrmf`` is ``{building, level, order, transform}``: the file's top level without levels and lifts, the level without
+its lists, its place in the file, and [scale, rotation, x, y] from pixels (y up) to metres. Geometry decides: an item
+that was moved by an edit gets vertices where it stands.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import MissingLayer
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _rmf, _yaml, register
+from app.formats._rmf import BUILDING, NAV_GRAPH, Array, Flow, index, listing, mapping, number, own, refuse, value_of
+from app.formats._text import DEGREES, METRES, numbers
+from app.model.features import Features, Properties, features, from_columns, points, segments, unique_ids
+from app.model.frame import GROUND, Level
+from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
+
+NAME = BUILDING
+FILE = "building.yaml"
+IMAGE, METRIC, ON_EARTH, MERCATOR = "reference_image", "cartesian_meters", "wgs84", "web_mercator"
+SYSTEMS = (IMAGE, METRIC, ON_EARTH, MERCATOR)
+DEGREE_SYSTEMS = frozenset({ON_EARTH, MERCATOR})
+
+LINES: Mapping[str, str] = {
+    "walls": "wall",
+    "doors": "door",
+    "measurements": "measurement",
+    "human_lanes": "human_lane",
+}
+RINGS: Mapping[str, str] = {"floors": "floor", "holes": "hole"}
+LISTS = frozenset({*LINES, *RINGS, "lanes", "vertices", "models", "fiducials"})
+"""What a level says in lists of items; all else of it stays in the document."""
+
+IN_PIXELS = frozenset(
+    {
+        *("constraints", "drawing", "features", "layers", "lights", "physical_cameras"),
+        *("flattened_x_offset", "flattened_y_offset", "x_meters", "y_meters"),
+    }
+)
+"""What a level's document says in pixels of its drawing."""
+
+LIFT_WORDS = frozenset({"x", "y", "yaw", "width", "depth"})
+LANE_TEMPLATE: Mapping[str, Any] = {"graph_idx": [2, 0], "orientation": [1, ""], "speed_limit": [3, 0.0]}
+DOOR_TEMPLATE: Mapping[str, Any] = {
+    "motion_axis": [1, "start"],
+    "motion_degrees": [3, 90.0],
+    "motion_direction": [2, 1],
+    "type": [1, "hinged"],
+}
+
+SMALLEST = 1e-9
+"""Metres per pixel, and pixels per metre: beyond it is a mistake."""
+
+MAX_FIDUCIALS = 200
+"""In common between two levels; each is compared with each."""
+
+_EARTH_TURN = 180.0 / 128.0
+
+
+# --- from the file's numbers to metres or degrees, and back -----------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """From a drawing's pixels (y up) to local metres: turned, scaled, then shifted."""
+
+    scale: float = 1.0
+    rotation: float = 0.0
+    shift: tuple[float, float] = (0.0, 0.0)
+
+    def apply(self, xy: Array) -> Array:
+        """Metres [n, 2] of pixels [n, 2]."""
+        with np.errstate(all="ignore"):  # what is not finite is refused with the item's name
+            return np.asarray((xy @ self._matrix().T) * self.scale + np.array(self.shift), np.float64)
+
+    def invert(self, xy: Array) -> Array:
+        """Pixels [n, 2] of metres [n, 2]."""
+        return np.asarray(((xy - np.array(self.shift)) / self.scale) @ self._matrix(), np.float64)
+
+    def _matrix(self) -> Array:
+        c, s = math.cos(self.rotation), math.sin(self.rotation)
+        return np.array([[c, -s], [s, c]])
+
+    def says(self) -> list[float]:
+        """The transform as a document keeps it."""
+        return [self.scale, self.rotation, *self.shift]
+
+    def near(self, other: Transform) -> bool:
+        """Whether both bring a pixel to the same place, to a micrometre or so."""
+        moved = max(abs(a - b) for a, b in zip(self.shift, other.shift, strict=True))
+        turn = abs(math.remainder(self.rotation - other.rotation, 2 * math.pi))
+        return abs(self.scale - other.scale) <= 1e-8 * abs(self.scale) and turn <= 1e-8 and moved <= 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Scaling:
+    """What of a level decides on transforms: measurements (pixels, metres) and fiducials (name, x, y; y up)."""
+
+    measurements: list[tuple[float, float]]
+    fiducials: list[tuple[str, float, float]]
+
+
+def transforms(levels: Mapping[str, Scaling], reference: str, warn: Callable[[str, str], None]) -> dict[str, Transform]:
+    """The transform of each level of a building in pixels, as rmf_building_map_tools computes it.
+
+    warn: called with (problem, place) where the scale cannot be told.
+    """
+    scales = [metres / pixels for pixels, metres in levels[reference].measurements if pixels > 0 and metres > 0]
+    if len(scales) < len(levels[reference].measurements):
+        warn("a measurement without length is not used", f"levels.{reference}.measurements")
+    if not scales:
+        warn("no measurement tells the scale: a pixel is taken as a metre", f"levels.{reference}.measurements")
+    scale = sum(scales) / len(scales) if scales else 1.0
+    if not SMALLEST <= scale <= 1 / SMALLEST:
+        refuse(f"gives {scale:g} metres per pixel, which is no scale", f"levels.{reference}.measurements")
+    out = {reference: Transform(scale)}
+    for name, level in levels.items():
+        if name != reference:
+            found = _by_fiducials(levels[reference].fiducials, level.fiducials, scale)
+            if found is None:
+                problem = "shares fewer than two fiducials with the reference level: a pixel is taken as a metre"
+                warn(problem, f"levels.{name}.fiducials")
+            out[name] = found or Transform()
+    return out
+
+
+def _by_fiducials(
+    reference: Sequence[tuple[str, float, float]], other: Sequence[tuple[str, float, float]], scale: float
+) -> Transform | None:
+    """Circular mean of the turns, mean of the relative scales and of the shifts, over pairs of common fiducials."""
+    by_name: dict[str, list[tuple[float, float]]] = {}
+    for name, x, y in other:
+        by_name.setdefault(name, []).append((x, y))
+    pairs = ((x, y, *b) for name, x, y in reference for b in by_name.get(name, ()))
+    common = np.array(list(islice(pairs, MAX_FIDUCIALS + 1)), np.float64).reshape(-1, 4)
+    if len(common) > MAX_FIDUCIALS:
+        refuse(f"two levels have more than {MAX_FIDUCIALS} fiducials in common", "fiducials")
+    first, second = np.triu_indices(len(common), 1)
+    with np.errstate(all="ignore"):
+        step = common[second] - common[first]
+        here, there = np.hypot(step[:, 0], step[:, 1]), np.hypot(step[:, 2], step[:, 3])
+        good = (here > 0) & (there > 0)
+        if not good.any():
+            return None
+        step, relative = step[good], float(np.mean(there[good] / here[good]))
+        turn = np.arctan2(step[:, 3], step[:, 2]) - np.arctan2(step[:, 1], step[:, 0])
+        rotation = -math.atan2(float(np.sin(turn).sum()), float(np.cos(turn).sum()))
+    if not SMALLEST <= scale / relative <= 1 / SMALLEST:
+        refuse("two levels whose fiducials lie at no common scale", "fiducials")
+    turned = Transform(1.0 / relative, rotation).apply(common[:, 2:])
+    shift = (common[:, :2] - turned).mean(axis=0) * scale
+    return Transform(scale / relative, rotation, (float(shift[0]), float(shift[1])))
+
+
+def _to_canonical(system: str, raw: Array, transform: Transform) -> Array:
+    """Local metres, or longitude and latitude in degrees, of the file's x and y."""
+    if system == IMAGE:
+        return transform.apply(raw * np.array([1.0, -1.0]))
+    if system == MERCATOR:
+        north = np.clip(raw[:, 1] / 128.0 + 1.0, -16.0, 16.0)
+        latitude: Array = np.degrees(2.0 * np.arctan(np.exp(np.pi * north)) - np.pi / 2.0)
+        return np.asarray(np.column_stack([raw[:, 0] * _EARTH_TURN - 180.0, latitude]), np.float64)
+    return raw
+
+
+def _to_file(system: str, at: Array, transform: Transform) -> Array:
+    """The reverse of ``_to_canonical``."""
+    if system == IMAGE:
+        return np.asarray(transform.invert(at) * np.array([1.0, -1.0]), np.float64)
+    if system == MERCATOR:
+        north = np.arctanh(np.sin(np.radians(np.clip(at[:, 1], -89.9999, 89.9999))))
+        return np.asarray(np.column_stack([at[:, 0] / _EARTH_TURN + 128.0, (north / np.pi - 1.0) * 128.0]), np.float64)
+    return at
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Level:
+    """A level as its file says it. raw: float64 [n, 2] as in the file; at: metres or degrees; ids: of the vertices."""
+
+    name: str
+    order: int
+    said: dict[str, Any]
+    raw: Array
+    rows: list[Any]
+    elevation: float
+    transform: Transform = field(default_factory=Transform)
+    at: Array = field(default_factory=lambda: np.empty((0, 2)))
+    ids: list[str] = field(default_factory=list)
+    dangling: dict[str, list[Any]] = field(default_factory=dict)
+
+    def where(self, section: str, k: int) -> str:
+        return f"levels.{self.name}.{section}[{k}]"
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """Topology and objects for each level, and the images that the file names as resources.
+
+    Coordinates are local metres, or degrees where the building's are. Raises UnreadableFile naming the place.
+    """
+    main = context.main or next(iter(files))
+    top = _yaml.load(files[main], context.limits)
+    if not isinstance(top, dict):
+        refuse("must be a mapping with levels", "")
+    said = mapping(top.get("levels"), "levels")
+    if not said:
+        refuse("a building needs at least one level", "levels")
+    system = top.get("coordinate_system", IMAGE)
+    if system not in SYSTEMS:
+        refuse(f"must be one of {', '.join(SYSTEMS)}, got {str(system)[:80]!r}", "coordinate_system")
+    levels = {name: _level(name, k, one) for k, (name, one) in enumerate(said.items())}
+    if context.level != GROUND:
+        context.warn(f"its levels have names of their own: level={context.level} is not used", where="levels")
+    reference = _reference(top, levels)
+    if system == IMAGE:
+        scaling = {name: _scaling(level) for name, level in levels.items()}
+        found = transforms(scaling, reference, lambda problem, where: context.warn(problem, where=where))
+        for name, level in levels.items():
+            level.transform = found[name]
+    taken: set[str] = set()
+    for level in levels.values():
+        level.at = _to_canonical(system, level.raw, level.transform)
+        level.ids = _node_ids(level, taken)
+        taken.update(level.ids)
+    building = {key: value for key, value in top.items() if key not in ("levels", "lifts")}
+    reader = _Reader(system, context, levels, reference)
+    parts: dict[PartKey, Part] = {}
+    lifts = reader.lifts(mapping(top.get("lifts"), "lifts"))
+    for level in levels.values():
+        network = reader.topology(level, taken)
+        objects = reader.objects(level, lifts.get(level.name, []))
+        document = {NAME: reader.document(level, building)}
+        parts[PartKey("topology", level.name, NETWORK)] = network.with_document(document)
+        parts[PartKey("objects", level.name, NAME)] = objects.with_document(document)
+    if not taken:  # nothing of the network is there: a map of this format alone, and of no other
+        for level in levels.values():
+            parts[PartKey("topology", level.name, NAME)] = parts[PartKey("topology", level.name, NETWORK)]
+    images = _images(files, main, levels, context)
+    if images and context.wants("resources"):
+        parts[PartKey("resources", GROUND, NAME)] = Resources(images)
+    parts = {key: part for key, part in parts.items() if context.wants(key.layer)}
+    return Layers(parts, None, tuple(Level(level.name, level.elevation) for level in levels.values()))
+
+
+def _level(name: str, order: int, said: Any) -> _Level:
+    where = f"levels.{name}"
+    one = mapping(said, where)
+    rows = listing(one.get("vertices"), f"{where}.vertices")
+    raw = _rmf.places(rows, f"{where}.vertices")
+    elevation = number(one.get("elevation", 0.0) or 0.0, f"{where}.elevation")
+    return _Level(name, order, one, raw, rows, elevation)
+
+
+def _reference(top: Mapping[str, Any], levels: Mapping[str, _Level]) -> str:
+    said = top.get("reference_level_name")
+    if said is None or said == "":
+        return next(iter(levels))
+    name = said if isinstance(said, str) else _yaml.text(said)
+    if name not in levels:
+        refuse(f"names the level {name[:80]!r}, which is not there", "reference_level_name")
+    return name
+
+
+def _scaling(level: _Level) -> Scaling:
+    measurements = []
+    for k, row in enumerate(listing(level.said.get("measurements"), f"levels.{level.name}.measurements")):
+        i, j, parameters, _ = _edge(row, level.where("measurements", k))
+        if 0 <= i < len(level.raw) and 0 <= j < len(level.raw):
+            metres = number(value_of(parameters, "distance"), f"{level.where('measurements', k)}.distance")
+            measurements.append((math.dist(level.raw[i], level.raw[j]), metres))
+    rows = listing(level.said.get("fiducials"), f"levels.{level.name}.fiducials")
+    at = _rmf.places(rows, f"levels.{level.name}.fiducials")
+    names = [_text(row[2]) if len(row) > 2 else "" for row in rows]
+    return Scaling(measurements, [(name, x, -y) for name, (x, y) in zip(names, at.tolist(), strict=True)])
+
+
+def _edge(row: Any, where: str) -> tuple[int, int, dict[str, Any], list[Any]]:
+    """(start, end, parameters, what stands behind them) of a row ``[i, j, {…}]``."""
+    if not isinstance(row, list) or len(row) < 2:
+        refuse("must be a list [vertex, vertex, {parameters}]", where)
+    parameters = mapping(row[2] if len(row) > 2 else None, f"{where}[2]")
+    return index(row[0], f"{where}[0]"), index(row[1], f"{where}[1]"), parameters, row[3:]
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else "" if value is None else _yaml.text(value)
+
+
+def _node_ids(level: _Level, taken: set[str]) -> list[str]:
+    wanted = []
+    for k, row in enumerate(level.rows):
+        name = row[3] if len(row) > 3 else ""
+        if isinstance(name, (list, dict)):
+            refuse("the name of a vertex must be a text", f"{level.where('vertices', k)}[3]")
+        wanted.append(_rmf.short(_text(name)) or f"{_rmf.short(level.name, 200)}/{k}")
+    return unique_ids(wanted, taken)
+
+
+class _Reader:
+    """A building being read: what its levels share."""
+
+    def __init__(self, system: str, context: ReadContext, levels: Mapping[str, _Level], reference: str) -> None:
+        self.system, self.context, self.levels, self.reference = system, context, levels, reference
+        self.degrees = system in DEGREE_SYSTEMS
+
+    def document(self, level: _Level, building: dict[str, Any]) -> dict[str, Any]:
+        """What stands in the documents of a level's parts."""
+        rest = {key: value for key, value in level.said.items() if key not in LISTS}
+        out: dict[str, Any] = {"building": building, "level": rest, "order": level.order}
+        if self.system == IMAGE:
+            out["transform"] = level.transform.says()
+        if level.dangling:
+            out["dangling"] = level.dangling
+        return out
+
+    def topology(self, level: _Level, taken: set[str]) -> Features:
+        """The vertices as nodes, the lanes as directed edges."""
+        properties: list[Properties] = []
+        heights = np.zeros(len(level.rows))
+        names = Counter[str]()
+        for k, row in enumerate(level.rows):
+            said: dict[str, Any] = {"kind": "node"}
+            rest: dict[str, Any] = {"index": k}
+            if len(row) > 3 and row[3] != "":
+                said["name"] = _text(row[3])
+                names[said["name"]] += 1
+                if not isinstance(row[3], str):
+                    rest["name"] = row[3]
+            if len(row) > 2 and row[2] != 0:
+                heights[k] = number(row[2], f"{level.where('vertices', k)}[2]")
+            if len(row) > 4 and row[4]:
+                rest["parameters"] = mapping(row[4], f"{level.where('vertices', k)}[4]")
+            if len(row) > 5:
+                rest["more"] = row[5:]
+            said[NAME] = rest
+            properties.append(said)
+        twice = sorted(name for name, count in names.items() if count > 1)
+        if twice:
+            self.context.warn(
+                f"{len(twice)} names stand for several vertices: {', '.join(twice[:5])}; robots cannot tell them apart",
+                where=f"levels.{level.name}.vertices",
+            )
+        geometry = points(level.at)
+        high = heights != 0
+        if high.any():
+            geometry[high] = points(np.column_stack([level.at[high], heights[high] + level.elevation]))
+        sources, targets, lanes = self._lanes(level)
+        ids = [_rmf.short(f"{level.ids[i]}_{level.ids[j]}", 490) for i, j in zip(sources, targets, strict=True)]
+        ids = unique_ids(ids, taken)
+        taken.update(ids)
+        for i, j, (lane, limit) in zip(sources, targets, lanes, strict=True):
+            said = {"kind": "edge", "source": level.ids[i], "target": level.ids[j], NAME: lane}
+            if limit:
+                said["speed_limit"] = limit
+            properties.append(said)
+        lines = segments(level.at[sources], level.at[targets]) if sources else np.empty(0, object)
+        both = np.concatenate([geometry, lines])
+        return from_columns([*level.ids, *ids], both, properties, "wgs84" if self.degrees else "local")
+
+    def _lanes(self, level: _Level) -> tuple[list[int], list[int], list[tuple[dict[str, Any], float]]]:
+        """(sources, targets, what only we know of each edge and its speed limit), two-way lanes as two."""
+        sources: list[int] = []
+        targets: list[int] = []
+        out = []
+        graphless = loops = 0
+        for k, i, j, parameters, more in self._between(level, "lanes"):
+            rest: dict[str, Any] = {"index": k, "parameters": parameters}
+            if more:
+                rest["more"] = more
+            said = value_of(parameters, "speed_limit", 0.0)
+            limit = 0.0
+            if isinstance(said, (int, float)) and not isinstance(said, bool) and said > 0:
+                limit = float(said)
+            graphless += value_of(parameters, "graph_idx") is None
+            loops += i == j
+            sources.append(i)
+            targets.append(j)
+            out.append((rest, limit))
+            if value_of(parameters, "bidirectional") is True:
+                sources.append(j)
+                targets.append(i)
+                out.append(({**rest, "reverse": True}, limit))
+        where = f"levels.{level.name}.lanes"
+        if loops:
+            self.context.warn(f"{loops} lanes lead from a vertex to itself", where=where)
+        if graphless:
+            problem = f"{graphless} lanes have no graph_idx: they are taken as lanes of graph 0"
+            self.context.warn(problem, where=where)
+        return sources, targets, out
+
+    def _between(self, level: _Level, section: str) -> Iterable[tuple[int, int, int, dict[str, Any], list[Any]]]:
+        """(place in the list, start, end, parameters, more) of the rows whose vertices exist."""
+        n = len(level.rows)
+        for k, row in enumerate(listing(level.said.get(section), f"levels.{level.name}.{section}")):
+            i, j, parameters, more = _edge(row, level.where(section, k))
+            if 0 <= i < n and 0 <= j < n:
+                yield k, i, j, parameters, more
+            else:
+                level.dangling.setdefault(section, []).append(row)
+                problem = f"joins the vertices {i} and {j}, but the level has {n}: it is kept in the level's document"
+                self.context.warn(problem, where=level.where(section, k))
+
+    def objects(self, level: _Level, lifts: list[tuple[str, Any, Properties]]) -> Features:
+        """Everything but vertices and lanes."""
+        rows: list[tuple[str, Any, Properties]] = []
+        prefix = _rmf.short(level.name, 200)
+        for section, kind in LINES.items():
+            for k, i, j, parameters, more in self._between(level, section):
+                rest: dict[str, Any] = {"index": k, "parameters": parameters, "vertices": [i, j]}
+                if more:
+                    rest["more"] = more
+                said: dict[str, Any] = {"kind": kind, NAME: rest}
+                name = value_of(parameters, "name")
+                if isinstance(name, str) and name:
+                    said["name"] = name
+                rows.append((f"{prefix}/{kind}/{k}", shapely.LineString(level.at[[i, j]]), said))
+        for section, kind in RINGS.items():
+            for k, one in enumerate(listing(level.said.get(section), f"levels.{level.name}.{section}")):
+                where = level.where(section, k)
+                said = dict(mapping(one, where))
+                corners = listing(said.pop("vertices", None), f"{where}.vertices")
+                ring = [index(v, f"{where}.vertices[{m}]") for m, v in enumerate(corners)]
+                good = [v for v in ring if 0 <= v < len(level.rows)]
+                if len(good) < len(ring):
+                    level.dangling.setdefault(section, []).append(one)
+                    self.context.warn("has vertices that do not exist: kept in the level's document", where=where)
+                    continue
+                rest = {"index": k, "vertices": ring, **said}
+                rows.append((f"{prefix}/{kind}/{k}", _ring(level.at[ring]), {"kind": kind, NAME: rest}))
+        rows += self._models(level, prefix)
+        marks = listing(level.said.get("fiducials"), f"levels.{level.name}.fiducials")
+        at = self._at(_rmf.places(marks, f"levels.{level.name}.fiducials"), level)
+        for k, row in enumerate(marks):
+            said = {"kind": "fiducial", NAME: {"index": k, **({"more": row[3:]} if len(row) > 3 else {})}}
+            if len(row) > 2:
+                said["name"] = _text(row[2])
+            rows.append((f"{prefix}/fiducial/{k}", shapely.Point(at[k]), said))
+        return features([*rows, *lifts], "wgs84" if self.degrees else "local")
+
+    def _at(self, raw: Array, level: _Level) -> Array:
+        return _to_canonical(self.system, raw, level.transform)
+
+    def _models(self, level: _Level, prefix: str) -> list[tuple[str, Any, Properties]]:
+        listed = listing(level.said.get("models"), f"levels.{level.name}.models")
+        raw = np.empty((len(listed), 2))
+        for k, one in enumerate(listed):
+            where = level.where("models", k)
+            raw[k] = [number(mapping(one, where).get(axis), f"{where}.{axis}") for axis in "xy"]
+        out: list[tuple[str, Any, Properties]] = []
+        for k, (one, (x, y)) in enumerate(zip(listed, self._at(raw, level).tolist(), strict=True)):
+            where = level.where("models", k)
+            rest = {key: value for key, value in one.items() if key not in ("x", "y")}
+            z, yaw = number(rest.get("z", 0.0), f"{where}.z"), number(rest.get("yaw", 0.0), f"{where}.yaw")
+            said: dict[str, Any] = {"kind": "model"}
+            if isinstance(rest.get("name"), str) and rest["name"]:
+                said["name"] = rest.pop("name")
+            if not self.degrees:
+                said["pose"] = [x, y, z + level.elevation, 0.0, 0.0, yaw + level.transform.rotation]
+                rest = {key: value for key, value in rest.items() if key != "yaw" and (key != "z" or value == 0)}
+            said[NAME] = {"index": k, "says": rest}
+            out.append((f"{prefix}/model/{k}", shapely.Point(x, y), said))
+        return out
+
+    def lifts(self, listed: Mapping[str, Any]) -> dict[str, list[tuple[str, Any, Properties]]]:
+        """The lifts by the level whose floor plan they are drawn on."""
+        out: dict[str, list[tuple[str, Any, Properties]]] = {}
+        for k, (name, one) in enumerate(listed.items()):
+            where = f"lifts.{name}"
+            rest = dict(mapping(one, where))
+            floor = _text(rest.get("reference_floor_name")) or self.reference
+            if floor not in self.levels:
+                problem = f"names the level {floor[:80]!r}, which is not there: {self.reference} is taken"
+                self.context.warn(problem, where=f"{where}.reference_floor_name")
+                floor = self.reference
+            x, y = (number(rest.pop(axis, None), f"{where}.{axis}") for axis in "xy")
+            yaw = number(rest.get("yaw", 0.0), f"{where}.yaw")
+            width, depth = (number(rest.pop(key, None), f"{where}.{key}") for key in ("width", "depth"))
+            at = self._at(np.array([[x, y]]), self.levels[floor])[0].tolist()
+            said: dict[str, Any] = {"kind": "lift", "name": name, "size": [width, depth, _rmf.CABIN_HEIGHT]}
+            if not self.degrees:
+                # The tools take a lift's yaw as it stands, on whatever floor plan it was drawn.
+                said["pose"] = [*at, self.levels[floor].elevation, 0.0, 0.0, yaw]
+                rest.pop("yaw", None)
+            said[NAME] = {"index": k, "says": rest}
+            row = (f"{_rmf.short(floor, 200)}/lift/{_rmf.short(name)}", shapely.Point(at), said)
+            out.setdefault(floor, []).append(row)
+        return out
+
+
+def _ring(at: Array) -> Any:
+    """A polygon; where there are too few corners for one, its points."""
+    if not len(at):
+        return None
+    closed = (at[0] == at[-1]).all()
+    if len(at) < (4 if closed else 3):
+        return shapely.MultiPoint(at)
+    return shapely.Polygon(at)
+
+
+# --- floor plan images -----------------------------------------------------------------------------------------------
+
+_FILENAME = re.compile(
+    rb"\bfilename[\"']?[ \t]*:[ \t]*(?:\"([^\"\n]{1,500})\"|'([^'\n]{1,500})'|([^\s,}#\"'][^,}#\n]{0,500}))"
+)
+_ELSEWHERE = re.compile(r"^[A-Za-z]:|^[/~\\]|^\$|://|\\")
+
+
+def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
+    """The images that a building names."""
+    said = {(a or b or c).decode("utf-8", "replace").strip() for a, b, c in _FILENAME.findall(data)}
+    known = _by_base(names)
+    found = (_find(name, main, known) for name in sorted(said) if name)
+    return [name for name in dict.fromkeys(found) if name]
+
+
+def _plain(said: str) -> str | None:
+    """The name as a safe path below the building's folder, or None where it leads elsewhere."""
+    path = PurePosixPath(said)
+    return None if _ELSEWHERE.search(said) or ".." in path.parts or not path.name else str(path)
+
+
+def _base(said: str) -> str:
+    return said.replace("\\", "/").rpartition("/")[2]
+
+
+def _by_base(names: Iterable[str]) -> dict[str, list[str]]:
+    """The files by their base names."""
+    out: dict[str, list[str]] = {}
+    for name in sorted(names):
+        out.setdefault(_base(name), []).append(name)
+    return out
+
+
+def _find(said: str, main: str, known: Mapping[str, Sequence[str]]) -> str | None:
+    """The file of the upload that a building means: beside it, else the first of that base name."""
+    found = known.get(_base(said), ())
+    folder = main.rpartition("/")[0]
+    beside = [f"{folder}/{name}" if folder else name for name in (_plain(said), _base(said)) if name]
+    return next((name for name in beside if name in found), found[0] if found else None)
+
+
+def _named(said: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
+    """(place, file name) of the images that a level's document names."""
+    drawing = said.get("drawing")
+    if isinstance(drawing, dict) and isinstance(drawing.get("filename"), str):
+        yield "drawing", drawing["filename"]
+    layers = said.get("layers")
+    for name, layer in layers.items() if isinstance(layers, dict) else ():
+        if isinstance(layer, dict) and isinstance(layer.get("filename"), str):
+            yield f"layers.{name}", layer["filename"]
+
+
+def _images(files: Files, main: str, levels: Mapping[str, _Level], context: ReadContext) -> dict[str, bytes]:
+    """The images by the path that the served building names them with."""
+    out: dict[str, bytes] = {}
+    known = _by_base(files)
+    for level in levels.values():
+        for place, said in _named(level.said):
+            if not said:
+                continue
+            where = f"levels.{level.name}.{place}.filename"
+            found = _find(said, main, known)
+            if found is None:
+                context.warn(f"the image {said[:200]!r} is not in the upload: the map is read without it", where=where)
+                continue
+            name = _plain(said)
+            if name is None:
+                name = _base(said)
+                context.warn(f"the image {said[:200]!r} is of another machine: {found} is taken", where=where)
+            out[name] = files[found]
+    return out
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Storey:
+    """A level to be written: its parts, and what their documents say."""
+
+    name: str
+    networks: list[Features] = field(default_factory=list)
+    objects: list[Features] = field(default_factory=list)
+    document: dict[str, Any] = field(default_factory=dict)
+
+
+class _RewriteError(Exception):
+    """The levels no longer agree on their coordinates: metres must be written. The text says why."""
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``building.yaml`` and the images it names, in the coordinates it came in; networks of other formats in metres.
+
+    Raises MissingLayer where there is neither a network nor anything that came from a building.
+    """
+    storeys = _storeys(layers)
+    if not storeys:
+        raise MissingLayer("openrmf needs a network: upload a building.yaml, tmap2 or OSM file")
+    resources: dict[str, bytes] = {}
+    for part in layers.of("resources", name=NAME).values():
+        resources.update(part.files if isinstance(part, Resources) else {})
+    known: list[dict[str, Any]] = []
+    for storey in storeys:
+        said = storey.document.get("building")
+        if isinstance(said, dict) and said not in known:
+            known.append(said)
+    systems = {said.get("coordinate_system", IMAGE) for said in known}
+    system = systems.pop() if len(systems) == 1 and (len(known) == 1 or systems == {METRIC}) else METRIC
+    why = "the levels come from different buildings" if len(known) > 1 and system == METRIC else ""
+    draft = WriteContext(context.title, context.options, context.attribution)
+    try:
+        files = _Writer(layers, draft, storeys, known[0] if known else {}, system, resources, why).files()
+        context.dropped += draft.dropped
+        context.template += draft.template
+        context.warnings += draft.warnings
+        return files
+    except _RewriteError as changed:
+        return _Writer(layers, context, storeys, known[0], METRIC, resources, str(changed)).files()
+
+
+def _storeys(layers: Layers) -> list[_Storey]:
+    """The levels in the order of their file; those that came from elsewhere last."""
+    found: dict[str, _Storey] = {}
+    own_names = {
+        (p.get("kind"), p.get("name"))
+        for key, part in layers.vector("objects").items()
+        if key.name == NAME
+        for p in part.properties
+    }
+    for key, objects in layers.vector("objects").items():
+        part = objects
+        if key.name == NAV_GRAPH:  # graphs repeat the doors and lifts of the building that they were made from
+            part = part.take(
+                [k for k, p in enumerate(part.properties) if (p.get("kind"), p.get("name")) not in own_names]
+            )
+        if key.name in (NAME, NAV_GRAPH) and (len(part) or NAME in part.document):
+            found.setdefault(key.level, _Storey(key.level)).objects.append(part)
+    for key, part in layers.vector("topology").items():
+        if len(part) or NAME in part.document:
+            found.setdefault(key.level, _Storey(key.level)).networks.append(part)
+    for storey in found.values():
+        for part in [*storey.objects, *storey.networks]:
+            said = part.document.get(NAME)
+            if isinstance(said, dict) and not storey.document:
+                storey.document = said
+    rank = {level.name: (level.elevation, level.name) for level in layers.levels}
+
+    def order(storey: _Storey) -> tuple[bool, int, tuple[float, str]]:
+        said = storey.document.get("order")
+        known = isinstance(said, int)
+        return (not known, said if isinstance(said, int) else 0, rank.get(storey.name, (0.0, storey.name)))
+
+    return sorted(found.values(), key=order)
+
+
+Sections = dict[str, list[str]]
+
+
+class _Vertices:
+    """The vertex list of a level being written: nodes first, then whatever corners the objects need."""
+
+    def __init__(self, texts: list[tuple[str, str]], rows: list[str], old: Mapping[int, int]) -> None:
+        self.rows = rows
+        self._old = old
+        self._texts = texts
+        self._by_place: dict[tuple[str, str], int] = {}
+        for k, place in enumerate(texts):
+            self._by_place.setdefault(place, k)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def at(self, place: tuple[str, str], hint: Any) -> int:
+        """The vertex at this place (x and y as texts): the one it stood on, else any, else a new one."""
+        known = self._old.get(hint) if isinstance(hint, int) else None
+        if known is not None and self._texts[known] == place:
+            return known
+        found = self._by_place.get(place)
+        if found is None:
+            found = self._by_place[place] = len(self.rows)
+            self._texts.append(place)
+            self.rows.append(f"[{place[0]}, {place[1]}, 0.0, '']")
+        return found
+
+
+class _Writer:
+    """One building being written in one coordinate system."""
+
+    def __init__(
+        self,
+        layers: Layers,
+        context: WriteContext,
+        storeys: Sequence[_Storey],
+        building: Mapping[str, Any],
+        system: str,
+        resources: Mapping[str, bytes],
+        why: str,
+    ) -> None:
+        self.layers, self.context, self.storeys, self.system = layers, context, storeys, system
+        self.building = dict(building)
+        self.resources = resources
+        self.why = why
+        self.converted = bool(building) and self.building.get("coordinate_system", IMAGE) != system
+        self.degrees = system in DEGREE_SYSTEMS
+        self.decimals = DEGREES if self.degrees else METRES
+        self.flow = Flow()
+        self.lost: Counter[str] = Counter()
+        self.made: Counter[str] = Counter()
+        self.used: dict[str, bytes] = {}
+        self.scaling: dict[str, Scaling] = {}
+        self.transforms = {s.name: self._transform(s) for s in storeys}
+        said = self.building.get("reference_level_name")
+        self.reference = _text(said) if _text(said) in self.transforms else storeys[0].name
+
+    def _transform(self, storey: _Storey) -> Transform:
+        said = storey.document.get("transform")
+        if self.system != IMAGE or not isinstance(said, list) or len(said) != 4:
+            return Transform()
+        return Transform(said[0], said[1], (said[2], said[3]))
+
+    def files(self) -> dict[str, bytes]:
+        """``building.yaml``, then the images."""
+        levels = "".join(self._level(storey) for storey in self.storeys)
+        lifts = self._lifts()
+        if self.system == IMAGE:
+            self._check()
+        top = self._top()
+        before = {key: value for key, value in top.items() if key < "levels"}
+        after = {key: value for key, value in top.items() if key > "levels"}
+        text = [_yaml.mapping(before, 0) if before else "", "levels:\n", levels, lifts]
+        text.append(_yaml.mapping(after, 0) if after else "")
+        self._report()
+        return {FILE: "".join(text).encode(), **dict(sorted(self.used.items()))}
+
+    def _top(self) -> dict[str, Any]:
+        top = {key: value for key, value in self.building.items() if key not in ("levels", "lifts")}
+        if "name" not in top and "building_name" not in top:
+            said = self._graph_name()
+            top["name"] = self.context.title if said is None else said
+            if said is None:
+                self.context.fill("name", self.context.title, "no source names the building")
+        if self.system != IMAGE or "coordinate_system" in top:
+            top["coordinate_system"] = self.system
+        if "reference_level_name" in top and _text(top["reference_level_name"]) not in self.transforms:
+            del top["reference_level_name"]
+        return top
+
+    def _graph_name(self) -> Any:
+        """What navigation graphs call the building."""
+        for storey in self.storeys:
+            for part in storey.networks:
+                graphs = mapping(mapping(part.document.get(NAV_GRAPH), NAV_GRAPH).get("graphs"), "graphs")
+                for graph in sorted(graphs):
+                    if isinstance(graphs[graph], dict) and graphs[graph].get("building_name") is not None:
+                        return graphs[graph]["building_name"]
+        return None
+
+    def _served(self, lift: str) -> dict[str, list[str]]:
+        """The levels with a node that a navigation graph puts into this lift, without doors."""
+        return {
+            storey.name: []
+            for storey in self.storeys
+            for part in storey.networks
+            if any(mapping(own(p, NAV_GRAPH).get("parameters"), "").get("lift") == lift for p in part.properties)
+        }
+
+    def _check(self) -> None:
+        """Whether a reader of this file places the levels where they are."""
+        found = transforms(self.scaling, self.reference, lambda problem, where: None)
+        for name, transform in self.transforms.items():
+            if not transform.near(found[name]):
+                raise _RewriteError(f"measurements and fiducials no longer place level {name} where it is")
+
+    # places
+
+    def _coordinates(self, part: Features, where: NDArray[np.intp], storey: str) -> tuple[Array, NDArray[np.intp]]:
+        """The file's x and y of all coordinates of these items, and the item each belongs to."""
+        chosen = part.take(where)
+        frame = self.layers.frame
+        geometry = chosen.in_wgs84(frame) if self.degrees else chosen.in_local(frame)
+        at, owner = shapely.get_coordinates(geometry, return_index=True)
+        return _to_file(self.system, at, self.transforms[storey]), owner
+
+    def _texts(self, raw: Array) -> list[tuple[str, str]]:
+        said = list(map(_yaml.decimal, numbers(raw.ravel(), self.decimals)))
+        return list(zip(said[::2], said[1::2], strict=True))
+
+    # levels
+
+    def _elevation(self, storey: _Storey) -> Any:
+        """As the level says it, unless the environment knows better."""
+        said = mapping(storey.document.get("level"), "level").get("elevation", 0.0)
+        known = next((level.elevation for level in self.layers.levels if level.name == storey.name), None)
+        return said if known is None or said == known else known
+
+    def _level(self, storey: _Storey) -> str:
+        rest = dict(mapping(storey.document.get("level"), "level"))
+        if self.converted:
+            lost = sorted(key for key in rest if key in IN_PIXELS and rest[key])
+            self.lost["what levels say in pixels of their drawing"] += len(lost)
+            rest = {key: value for key, value in rest.items() if key not in IN_PIXELS}
+        rest["elevation"] = self._elevation(storey)
+        self._drawings(rest, storey.name)
+        vertices, ids = self._nodes(storey)
+        sections: Sections = {"lanes": self._lanes(storey, ids)}
+        self._objects(storey, vertices, sections)
+        self._dangling(storey, vertices, sections)
+        sections["vertices"] = vertices.rows
+        out = [f"  {_yaml.text(storey.name)}:\n"]
+        for key in sorted({*rest, *(k for k, rows in sections.items() if rows)}):
+            if key in sections:
+                out.append(f"    {key}:\n")
+                out += [f"      - {row}\n" for row in sections[key]]
+            else:
+                out.append(_yaml.mapping({key: rest[key]}, 4))
+        return "".join(out)
+
+    def _drawings(self, rest: dict[str, Any], level: str) -> None:
+        """Take along the images that the level names, under names that stay below the building's folder."""
+        for place, said in list(_named(rest)):
+            name = next((n for n in (_plain(said), _base(said)) if n in self.resources), None)
+            if name is None:
+                if said:
+                    problem = f"the image {said[:200]!r} was not in the upload: it is named and not served"
+                    self.context.warn(problem, where=f"levels.{level}.{place}.filename")
+                continue
+            self.used[name] = self.resources[name]
+            if name != said:
+                outer, _, inner = place.partition(".")
+                if inner:
+                    rest[outer] = {**rest[outer], inner: {**rest[outer][inner], "filename": name}}
+                else:
+                    rest[outer] = {**rest[outer], "filename": name}
+
+    def _nodes(self, storey: _Storey) -> tuple[_Vertices, dict[str, int]]:
+        """The nodes as vertices in their old order, and each id's place among them."""
+        elevation = float(self._elevation(storey))
+        found: list[tuple[tuple[bool, int, int, str], str, tuple[str, str], str, int | None]] = []
+        for part in storey.networks:
+            point = (shapely.get_type_id(part.geometry) == 0) & ~shapely.is_empty(part.geometry)
+            node: NDArray[np.bool_] = np.array([p.get("kind") == "node" for p in part.properties], bool)
+            self.lost["nodes without a point"] += int((node & ~point).sum())
+            where = np.flatnonzero(node & point)
+            raw, _ = self._coordinates(part, where, storey.name)
+            z = shapely.get_z(part.geometry[where])
+            for k, place, high in zip(where.tolist(), self._texts(raw), z.tolist(), strict=True):
+                p = part.properties[k]
+                at = own(p, NAME).get("index")
+                known = isinstance(at, int)
+                key = (not known, at if isinstance(at, int) else 0, len(part.ids[k]), part.ids[k])
+                height = 0.0 if math.isnan(high) else high - elevation
+                row = self._vertex(part.ids[k], p, place, height)
+                found.append((key, part.ids[k], place, row, at if known else None))
+        found.sort(key=lambda row: row[0])
+        ids: dict[str, int] = {}
+        old: dict[int, int] = {}
+        for k, (_, i, _, _, was) in enumerate(found):
+            ids.setdefault(i, k)
+            if was is not None:
+                old.setdefault(was, k)
+        return _Vertices([row[2] for row in found], [row[3] for row in found], old), ids
+
+    def _vertex(self, i: str, p: Properties, place: tuple[str, str], z: float) -> str:
+        rest = own(p, NAME)
+        said = p.get("name")
+        parameters = rest.get("parameters")
+        if NAME in p:
+            name = rest["name"] if "name" in rest and _text(rest["name"]) == said else said or ""
+        else:
+            name = said if isinstance(said, str) and (said or NAV_GRAPH in p) else "" if NAV_GRAPH in p else i
+            graph = mapping(own(p, NAV_GRAPH).get("parameters"), "parameters")
+            parameters = {key: _rmf.typed(value) for key, value in graph.items() if key not in ("name", "lift")}
+            self.lost["nodes' attributes of other formats"] += any(
+                isinstance(v, dict) for key, v in p.items() if key != NAV_GRAPH
+            )
+        self.lost["nodes' orientations"] += p.get("orientation") is not None
+        row = f"[{place[0]}, {place[1]}, {_yaml.text(round(z, METRES) + 0.0)}, {_yaml.text(name)}"
+        if parameters or rest.get("more"):
+            row += f", {self.flow(parameters or {})}"
+        return row + "".join(f", {self.flow(v)}" for v in rest.get("more") or ()) + "]"
+
+    # lanes
+
+    def _lanes(self, storey: _Storey, ids: Mapping[str, int]) -> list[str]:
+        """The edges as lanes: those of one lane, or opposite ones that say the same, as one two-way lane."""
+        lanes = [lane for part in storey.networks for lane in self._edges(part, ids)]
+        lanes.sort(key=lambda lane: lane.key)
+        waiting: dict[Any, list[_Lane]] = {}
+        out: list[_Lane] = []
+        for lane in lanes:
+            partner = waiting.get(lane.partner())
+            if partner and lane.source != lane.target:
+                first = partner.pop()
+                first.both = True
+                continue
+            waiting.setdefault(lane.says(), []).append(lane)
+            out.append(lane)
+        return [lane.row(self.flow) for lane in out]
+
+    def _edges(self, part: Features, ids: Mapping[str, int]) -> Iterable[_Lane]:
+        bends = shapely.get_num_coordinates(part.geometry)
+        for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
+            if p.get("kind") == "node":
+                continue
+            source, target = ids.get(str(p.get("source"))), ids.get(str(p.get("target")))
+            if p.get("kind") != "edge" or source is None or target is None:
+                self.lost["edges without two nodes on their level"] += 1
+                continue
+            self.lost["edges' bends between their nodes"] += int(bends[k] > 2)
+            self.lost["edges' actions"] += p.get("action") is not None
+            self.lost["edges' widths"] += p.get("width") is not None
+            rest = own(p, NAME)
+            if NAME not in p:
+                self.made["lanes"] += NAV_GRAPH not in p
+                rest = {"parameters": _lane_parameters(p)}
+                self.lost["edges' attributes of other formats"] += any(
+                    isinstance(v, dict) for key, v in p.items() if key != NAV_GRAPH
+                )
+            yield _Lane.of(i, p, rest, source, target)
+
+    def _dangling(self, storey: _Storey, vertices: _Vertices, sections: Sections) -> None:
+        """Rows to vertices that did not exist come back where they still do not."""
+        for section, rows in mapping(storey.document.get("dangling"), "dangling").items():
+            for row in rows:
+                ends = row["vertices"] if isinstance(row, dict) else row[:2]
+                if section in RINGS or not all(0 <= v < len(vertices) for v in ends):
+                    sections.setdefault(section, []).append(self.flow(row))
+                    problem = f"{section} with vertices that do not exist: rmf_building_map_tools will refuse the file"
+                    self.context.warn(problem, where=f"levels.{storey.name}.{section}")
+                else:
+                    self.lost[f"{section} to vertices that did not exist"] += 1
+
+    # objects
+
+    def _objects(self, storey: _Storey, vertices: _Vertices, sections: Sections) -> None:
+        sections_of = {kind: section for section, kind in {**LINES, **RINGS}.items()}
+        found: dict[str, list[tuple[tuple[bool, int, str], str]]] = {}
+        scaling = Scaling([], [])
+        for part in storey.objects:
+            everything = np.arange(len(part))
+            raw, owner = self._coordinates(part, everything, storey.name)
+            texts = self._texts(raw)
+            first = np.searchsorted(owner, everything)
+            last = np.searchsorted(owner, everything, side="right")
+            order = sorted(range(len(part)), key=lambda k: _place(part.ids[k], part.properties[k]))
+            for k in order:
+                p = part.properties[k]
+                kind, at = p.get("kind"), texts[first[k] : last[k]]
+                where = raw[first[k] : last[k]]
+                key = _place(part.ids[k], p)
+                if kind == "lift":
+                    continue
+                if kind in LINES.values() and len(at) >= 2:
+                    row, parameters = self._line(p, vertices, [at[0], at[-1]])
+                    self.lost["bends of walls, doors and measurements"] += int(len(at) > 2)
+                    if kind == "measurement":
+                        metres = value_of(parameters, "distance", 0.0)
+                        length = math.dist(where[0], where[-1])
+                        scaling.measurements.append((length, float(metres)))
+                    found.setdefault(sections_of[str(kind)], []).append((key, row))
+                elif kind in RINGS.values() and len(at):
+                    rows = [(key, row) for row in self._rings(p, part.geometry[k], vertices, at)]
+                    found.setdefault(sections_of[str(kind)], []).extend(rows)
+                elif kind == "model" and len(at) == 1:
+                    found.setdefault("models", []).append((key, self._model(p, at[0], storey)))
+                elif kind == "fiducial" and len(at) == 1:
+                    name = str(p.get("name") or "")
+                    more = own(p, NAME).get("more") or []
+                    row = f"[{at[0][0]}, {at[0][1]}, {_yaml.text(name)}{''.join(', ' + self.flow(v) for v in more)}]"
+                    found.setdefault("fiducials", []).append((key, row))
+                    scaling.fiducials.append((name, float(at[0][0]), -float(at[0][1])))
+                else:
+                    self.lost["objects that are no part of a building"] += 1
+        for section, rows_of in found.items():
+            sections[section] = [row for _, row in sorted(rows_of, key=lambda item: item[0])]
+        self.scaling[storey.name] = scaling
+
+    def _line(self, p: Properties, vertices: _Vertices, ends: list[tuple[str, str]]) -> tuple[str, dict[str, Any]]:
+        rest = own(p, NAME)
+        hints = rest.get("vertices")
+        hints = hints if isinstance(hints, list) and len(hints) == 2 else [None, None]
+        i, j = (vertices.at(place, hint) for place, hint in zip(ends, hints, strict=True))
+        parameters = dict(mapping(rest.get("parameters"), "parameters"))
+        if p.get("kind") == "door" and "parameters" not in rest:
+            parameters = dict(DOOR_TEMPLATE)
+            self.made["doors"] += 1
+        name = p.get("name")
+        if isinstance(name, str) and name and value_of(parameters, "name") != name:
+            parameters["name"] = [1, name]
+        more = "".join(f", {self.flow(v)}" for v in rest.get("more") or ())
+        return f"[{i}, {j}, {self.flow(parameters)}{more}]", parameters
+
+    def _rings(self, p: Properties, geometry: Any, vertices: _Vertices, texts: list[tuple[str, str]]) -> Iterable[str]:
+        rest = own(p, NAME)
+        said = {key: value for key, value in rest.items() if key not in ("index", "vertices")}
+        said.setdefault("parameters", {})
+        said_hints = rest.get("vertices")
+        hints: list[Any] = said_hints if isinstance(said_hints, list) else []
+        pieces = list(geometry.geoms) if geometry.geom_type == "MultiPolygon" else [geometry]
+        done = 0
+        for piece in pieces:
+            count = int(shapely.get_num_coordinates(piece))
+            ring = texts[done : done + count]
+            done += count
+            if piece.geom_type == "Polygon":
+                self.lost["holes in floors"] += len(piece.interiors)
+                ring = ring[: len(piece.exterior.coords)]
+                if len(ring) != len(hints):  # a polygon repeats its first corner, a floor need not
+                    ring = ring[:-1]
+            known = hints if len(hints) == len(ring) else [None] * len(ring)
+            corners = [vertices.at(place, hint) for place, hint in zip(ring, known, strict=True)]
+            yield self.flow({**said, "vertices": corners})
+
+    def _model(self, p: Properties, place: tuple[str, str], storey: _Storey) -> str:
+        rest = dict(mapping(own(p, NAME).get("says"), "says"))
+        pose = _rmf.pose_of(p)
+        if pose is not None and not self.degrees:
+            z = round(pose[2] - float(self._elevation(storey)), METRES) + 0.0
+            if z or "z" not in rest:
+                rest["z"] = z
+            rest["yaw"] = round(pose[5] - self.transforms[storey.name].rotation, DEGREES) + 0.0
+            self.lost["models' roll and pitch"] += bool(pose[3] or pose[4])
+        rest.setdefault("yaw", 0.0)
+        if isinstance(p.get("name"), str):
+            rest["name"] = p["name"]
+        rest["x"], rest["y"] = (float(v) for v in place)
+        return self.flow(rest)
+
+    def _lifts(self) -> str:
+        """The lifts of all levels, in the order of their file."""
+        found: list[tuple[tuple[bool, int, str], str, dict[str, Any]]] = []
+        for storey in self.storeys:
+            for part in storey.objects:
+                for k, p in enumerate(part.properties):
+                    if p.get("kind") != "lift":
+                        continue
+                    if int(shapely.get_type_id(part.geometry[k])) != 0 or part.geometry[k].is_empty:
+                        self.lost["lifts without a point"] += 1
+                        continue
+                    rest = dict(mapping(own(p, NAME).get("says"), "says"))
+                    floor = _text(rest.get("reference_floor_name"))
+                    floor = floor if floor in self.transforms else self.reference
+                    raw, _ = self._coordinates(part, np.array([k]), floor)
+                    (x, y) = self._texts(raw)[0]
+                    rest["x"], rest["y"] = float(x), float(y)
+                    size = _rmf.size_of(p) or (1.0, 1.0)
+                    rest["width"], rest["depth"] = size
+                    pose = _rmf.pose_of(p)
+                    if pose is not None and not self.degrees:
+                        rest["yaw"] = round(pose[5], DEGREES) + 0.0
+                    rest.setdefault("yaw", 0.0)
+                    if NAME not in p:
+                        self.made["lifts"] += 1
+                        served = self._served(str(p.get("name")))
+                        rest |= {"doors": {}, "level_doors": served, "reference_floor_name": floor, "plugins": True}
+                    found.append((_place(part.ids[k], p), str(p.get("name") or part.ids[k]), rest))
+        found.sort(key=lambda item: item[0])
+        names = unique_ids(name for _, name, _ in found)
+        if not found:
+            return "lifts: {}\n"
+        # The first lift whose shaft holds a vertex is the vertex' lift, so their order is kept.
+        said = zip(names, found, strict=True)
+        return "lifts:\n" + "".join(_yaml.mapping({name: rest}, 2) for name, (_, _, rest) in said)
+
+    def _report(self) -> None:
+        if self.why:
+            what = "cartesian_meters is written instead of the source's coordinates"
+            self.context.warn(f"{self.why}: {what}", file=FILE, where="coordinate_system")
+        for what, count in sorted(self.lost.items()):
+            self.context.drop(what, count, "a building in these coordinates has no place for it")
+        if self.made["lanes"]:
+            fill = {key: value[1] for key, value in LANE_TEMPLATE.items()}
+            self.context.fill("lanes: parameters", fill, f"{self.made['lanes']} edges come from another format")
+        if self.made["doors"]:
+            said = {key: value[1] for key, value in DOOR_TEMPLATE.items()}
+            self.context.fill("doors: parameters", said, f"{self.made['doors']} doors come from a navigation graph")
+        if self.made["lifts"]:
+            why = f"{self.made['lifts']} lifts come from a navigation graph"
+            self.context.fill(
+                "lifts: doors, level_doors, reference floor",
+                "none, on the levels of its vertices, the first level",
+                why,
+            )
+
+
+def _place(i: str, p: Properties) -> tuple[bool, int, str]:
+    """The order of items in their list: as in the file, then by id."""
+    at = own(p, NAME).get("index", own(p, NAV_GRAPH).get("index"))
+    known = isinstance(at, int)
+    return (not known, at if isinstance(at, int) else 0, i)
+
+
+def _lane_parameters(p: Properties) -> dict[str, Any]:
+    """The parameters of a lane that comes from another format."""
+    out = {key: list(value) for key, value in LANE_TEMPLATE.items()}
+    graph = own(p, NAV_GRAPH)
+    said = mapping(graph.get("parameters"), "parameters")
+    if isinstance(graph.get("graph"), int):
+        out["graph_idx"] = [2, graph["graph"]]
+    for key, value in said.items():
+        if key == "orientation_constraint":
+            out["orientation"] = [1, value]
+        elif key not in ("door_name", "speed_limit", "is_bidirectional", "dock_name", "undock_name"):
+            out[key] = _rmf.typed(value)
+    return out
+
+
+@dataclass(slots=True)
+class _Lane:
+    """A directed edge on its way to a lane. was: its lane's place in the file; reverse: it is that lane backwards."""
+
+    key: tuple[bool, int, bool, int, str]
+    source: int
+    target: int
+    was: int | None
+    reverse: bool
+    limit: float
+    parameters: dict[str, Any]
+    more: list[Any]
+    signature: str
+    both: bool = False
+
+    @classmethod
+    def of(cls, i: str, p: Properties, rest: Mapping[str, Any], source: int, target: int) -> _Lane:
+        """The edge with this id and properties; rest: what is known of its lane."""
+        was = rest.get("index") if isinstance(rest.get("index"), int) else None
+        reverse = rest.get("reverse") is True
+        parameters = dict(mapping(rest.get("parameters"), "parameters"))
+        limit = _rmf.limit(p)
+        said = value_of(parameters, "speed_limit", 0.0)
+        if (said if isinstance(said, (int, float)) and said > 0 else 0.0) != limit:
+            parameters["speed_limit"] = [3, limit]
+        key = (was is None, was or 0, reverse, len(i), i)
+        known = {k: v for k, v in parameters.items() if k != "orientation"}
+        signature = str(was) if was is not None else Flow()(known)
+        more = rest.get("more") if isinstance(rest.get("more"), list) else []
+        return cls(key, source, target, was, reverse, limit, parameters, list(more or ()), signature)
+
+    def _orientation(self) -> Any:
+        return str(value_of(self.parameters, "orientation", ""))
+
+    def says(self) -> Any:
+        """Equal for edges that could be one."""
+        kept = self._orientation() if self.was is None else self.reverse
+        return (self.source, self.target, self.limit, self.signature, kept)
+
+    def partner(self) -> Any:
+        """What the edge back says, if both are one two-way lane."""
+        kept = _rmf.turned(self._orientation()) if self.was is None else not self.reverse
+        return (self.target, self.source, self.limit, self.signature, kept)
+
+    def row(self, flow: Flow) -> str:
+        """The lane's row."""
+        parameters = self.parameters
+        if self.both or value_of(parameters, "bidirectional") is True or self.was is None:
+            parameters = {**parameters, "bidirectional": [4, self.both]}
+        if self.reverse and "orientation" in parameters:
+            parameters = {**parameters, "orientation": [1, _rmf.turned(self._orientation())]}
+        more = "".join(f", {flow(v)}" for v in self.more)
+        return f"[{self.source}, {self.target}, {flow(parameters)}{more}]"
+
+
+# --- the format ------------------------------------------------------------------------------------------------------
+
+_LEVELS = re.compile(rb"(?m)^levels[ \t]*:")
+_OF_GRAPH = re.compile(rb"(?m)^building_name[ \t]*:")
+_OF_BUILDING = re.compile(
+    rb"(?m)^(?:coordinate_system|crowd_sim|reference_level_name)[ \t]*:"
+    rb"|^[ \t]+(?:walls|measurements|drawing|elevation|floors|fiducials|models|human_lanes|flattened_x_offset)[ \t]*:"
+)
+_VERTICES = re.compile(rb"(?m)^[ \t]+vertices[ \t]*:")
+_NAMED = re.compile(rb"(?m)^name[ \t]*:")
+
+
+def detect(name: str, data: bytes) -> bool:
+    """YAML with levels that have what only a building has, or a name and vertices."""
+    if not name.lower().endswith((".yaml", ".yml")) or not _LEVELS.search(data):
+        return False
+    if _OF_BUILDING.search(data):
+        return True
+    return bool(not _OF_GRAPH.search(data) and _NAMED.search(data) and _VERTICES.search(data))
+
+
+def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
+    """The networks, the objects that came from a building or a navigation graph, and the building's images."""
+    return [
+        key
+        for key in keys
+        if key.layer == "topology"
+        or (key.layer == "objects" and key.name in (NAME, NAV_GRAPH))
+        or (key.layer == "resources" and key.name == NAME)
+    ]
+
+
+register(
+    Format(
+        name=NAME,
+        title="Building (Open-RMF traffic editor)",
+        files=(FILE,),
+        media_types=("application/yaml",),
+        carries=frozenset({"topology", "objects", "resources"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
+        companions=companions,
+        family=NAME,
+        rank=40,
+        extensions=(".building.yaml", ".yaml", ".yml"),
+        choose=choose,
+    )
+)

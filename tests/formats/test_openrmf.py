@@ -1,0 +1,420 @@
+"""openrmf: real buildings come back the same, stand where the official tools place them; edits and other networks."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import yaml
+
+from app import formats
+from app.bundle import Hints
+from app.convert import offline
+from app.errors import BadUpload, MissingLayer, UnreadableFile
+from app.formats import Group, Limits, ReadContext, WriteContext, get_format
+from app.model.features import Features, features
+from app.model.frame import Datum, Level
+from app.model.geodesy import local_frame
+from app.model.layers import Layers, Part, PartKey, Resources
+
+FORMAT = get_format("openrmf")
+SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "openrmf"
+Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
+
+
+def sample(name: str) -> dict[str, bytes]:
+    folder = SAMPLES / name
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def read(files: dict[str, bytes] | str, **context: Any) -> tuple[Layers, ReadContext]:
+    given = {"a.building.yaml": files.encode()} if isinstance(files, str) else files
+    told = ReadContext(**context)
+    main = next(n for n in given if n.endswith(".building.yaml"))
+    return formats.read(Group(FORMAT, main, given), told), told
+
+
+def write(layers: Layers) -> tuple[dict[str, Any], dict[str, bytes], WriteContext]:
+    told = WriteContext()
+    files = formats.write(FORMAT, layers, told)
+    return yaml.safe_load(files["building.yaml"]), files, told
+
+
+def part(layers: Layers, layer: str, level: str) -> Features:
+    found = layers.parts[PartKey(layer, level, "network" if layer == "topology" else "openrmf")]  # type: ignore[arg-type]
+    assert isinstance(found, Features)
+    return found
+
+
+def place(features_: Features, i: str) -> list[float]:
+    return shapely.get_coordinates(features_.geometry[features_.index()[i]])[0].tolist()
+
+
+def problems(context: ReadContext | WriteContext) -> str:
+    return "\n".join(f"{p.where}: {p.problem}" for p in context.warnings)
+
+
+def with_part(layers: Layers, key: PartKey, new: Part) -> Layers:
+    return Layers({**layers.parts, key: new}, layers.datum, layers.levels)
+
+
+def real(shared: Path) -> list[Path]:
+    found = sorted((shared / "data" / "openrmf_building").glob("*/*.building.yaml"))
+    assert len(found) >= 7
+    return found
+
+
+def test_every_real_building_comes_back_the_same_with_its_images(shared: Path, same: Same) -> None:
+    for path in real(shared):
+        files = {path.name: path.read_bytes(), **{p.name: p.read_bytes() for p in path.parent.glob("*.png")}}
+        back = offline(files, "openrmf").files
+        assert same("openrmf", files, back) == [], path
+        for name, data in back.items():
+            assert name == "building.yaml" or data == files[name], "an image is kept byte for byte"
+        assert offline(back, "openrmf", hints=Hints("openrmf")).files == back
+
+
+def test_facts_of_every_real_building_hold_in_the_layers(shared: Path, facts_json: dict[str, Any]) -> None:
+    counted = ("walls", "doors", "floors", "models", "measurements", "fiducials", "holes")
+    for path in real(shared):
+        facts = facts_json[path.relative_to(shared / "data").as_posix()]["facts"]
+        layers, _ = read({path.name: path.read_bytes()})
+        lifts = 0
+        for level, said in facts["levels"].items():
+            network, objects = part(layers, "topology", level), part(layers, "objects", level)
+            kinds = Counter(p["kind"] for p in [*network.properties, *objects.properties])
+            assert kinds["node"] == said["vertices"]
+            assert kinds["edge"] == said["directed_lanes"]
+            assert {k: kinds[k[:-1]] for k in counted} == {k: said[k] for k in counted}
+            assert sum("name" in p for p in network.properties if p["kind"] == "node") == said["named_vertices"]
+            graphs = Counter(
+                str(p["openrmf"]["parameters"]["graph_idx"][1]) for p in network.of_kind("edge").properties
+            )
+            both = {k: v * 2 for k, v in said["lanes_by_graph_idx"].items()}
+            assert graphs == both or said["lanes_unidirectional"]
+            lifts += kinds["lift"]
+            official = facts["official_generator"]["levels"][level]
+            scale, rotation, x, y = network.document["openrmf"]["transform"]
+            assert scale == pytest.approx(official["scale_m_per_px"], abs=1e-11)
+            assert rotation == pytest.approx(official["rotation_rad"], abs=1e-11)
+            assert [x, y] == pytest.approx(official["translation"], abs=1e-8)
+            nodes = network.of_kind("node")
+            at = shapely.get_coordinates(nodes.geometry)
+            assert np.abs([at.min(0), at.max(0)] - np.array(official["vertex_bounds_m"])).max() < 6e-5
+            first = next(k for k, p in enumerate(nodes.properties) if p["openrmf"]["index"] == 0)
+            assert at[first].tolist() == pytest.approx(official["first_vertex_m"], abs=6e-7)
+            assert layers.elevation(level) == said["elevation"]
+        assert lifts == len(facts["lifts"])
+
+
+def test_levels_are_placed_by_measurements_and_fiducials() -> None:
+    """By hand: 0.098 m per pixel downstairs; upstairs half of it, turned by a quarter."""
+    layers, told = read(sample("clinic"))
+    ground, up = part(layers, "topology", "Ground floor"), part(layers, "topology", "Upstairs")
+    assert place(ground, "charger_1") == pytest.approx([2.94, -2.94])
+    assert place(ground, "lift_ground") == pytest.approx([9.8, -4.41])
+    assert place(up, "lift_up") == pytest.approx([9.8, -4.41])
+    assert up.document["openrmf"]["transform"][:2] == pytest.approx([0.049, math.pi / 2])
+    assert layers.levels == (Level("Ground floor", 0.0), Level("Upstairs", 3.5))
+    assert set(ground.ids) > {"Ground floor/0", "charger_1", "ward: 3", "charger_1_ward: 3", "ward: 3_charger_1"}
+    edge = ground.properties[ground.index()["charger_1_ward: 3"]]
+    assert (edge["source"], edge["target"], edge["speed_limit"]) == ("charger_1", "ward: 3", 0.5)
+    objects = part(layers, "objects", "Ground floor")
+    kinds = {p["kind"] for p in objects.properties}
+    assert kinds == {"wall", "door", "measurement", "human_lane", "floor", "hole", "model", "fiducial", "lift"}
+    lamp = objects.properties[objects.index()["Ground floor/model/1"]]
+    assert lamp["pose"] == pytest.approx([7.84, -1.176, 1.25, 0, 0, -0.5])
+    lift = objects.properties[objects.index()["Ground floor/lift/Lift A"]]
+    assert lift["size"][:2] == [2, 2.5]
+    assert lift["pose"] == pytest.approx([9.8, -4.41, 0, 0, 0, 0.25])
+    door = objects.index()["Ground floor/door/0"]
+    assert objects.properties[door]["name"] == "ward_door"
+    assert shapely.get_coordinates(objects.geometry[door]).ravel() == pytest.approx([5.88, -0.98, 5.88, -3.92])
+    assert "of another machine" in problems(told)
+    assert sorted(layers.resources()) == ["plans/ground.png", "scan.png", "up.png"]
+
+
+def test_an_image_of_another_machine_is_served_under_its_base_name() -> None:
+    said, files, _ = write(read(sample("clinic"))[0])
+    assert said["levels"]["Upstairs"]["drawing"]["filename"] == "up.png"
+    assert files["up.png"] == sample("clinic")["plans/up.png"]
+    assert said["levels"]["Ground floor"]["layers"]["laser"]["filename"] == "scan.png"
+
+
+def test_our_samples_come_back_with_the_same_rows() -> None:
+    for name in ("clinic", "yard", "quay"):
+        files = sample(name)
+        original = yaml.safe_load(files[f"{name}.building.yaml"])
+        said, _, told = write(read(files)[0])
+        for level, one in original["levels"].items():
+            for section, rows in one.items():
+                if section in ("drawing", "layers"):
+                    continue
+                if section == "floors":
+                    rows = [{"parameters": {}, **row} for row in rows]
+                if section in ("vertices", "fiducials"):
+                    for row, new in zip(rows, said["levels"][level][section], strict=True):
+                        assert new[:2] == pytest.approx(row[:2], abs=1e-9)
+                        assert new[2:] == row[2:]
+                elif section == "models":
+                    for row, new in zip(rows, said["levels"][level][section], strict=True):
+                        assert new == pytest.approx({"z": 0, **row}, abs=1e-9)
+                else:
+                    assert said["levels"][level].get(section) == rows or rows == {}, (name, level, section)
+        for key, value in original.items():
+            if key == "lifts" and value:
+                old, new = value["Lift A"], said["lifts"]["Lift A"]
+                assert [new.pop(axis) for axis in "xy"] == pytest.approx([old.pop(axis) for axis in "xy"], abs=1e-9)
+                assert new == old
+            elif key != "levels":
+                assert said[key] == value
+        assert not told.dropped
+
+
+def test_degrees_stay_degrees_and_metres_stay_metres() -> None:
+    quay, _ = read(sample("quay"))
+    network = part(quay, "topology", "L1")
+    assert not network.local.any()
+    assert place(network, "berth_1") == [103.78, 1.3]
+    yard, told = read(sample("yard"))
+    ground = part(yard, "topology", "ground")
+    assert place(ground, "gate#2") == [12.5, -3.25]
+    assert ground.geometry[ground.index()["ground/2"]].z == 0.5
+    assert "stand for several vertices" in problems(told)
+    assert "from a vertex to itself" in problems(told)
+
+
+def test_web_mercator_is_brought_to_degrees_and_back() -> None:
+    text = """
+coordinate_system: web_mercator
+name: m
+levels:
+  L: {elevation: 0, vertices: [[128, -128, 0, origin], [201.8, -127.1, 0, x]], lanes: [[0, 1, {graph_idx: [2, 0]}]]}
+"""
+    layers, _ = read(text)
+    network = part(layers, "topology", "L")
+    assert place(network, "origin") == pytest.approx([0.0, 0.0], abs=1e-12)
+    x, y = place(network, "x")
+    assert x == pytest.approx((201.8 - 128) / 128 * 180)
+    assert math.asinh(math.tan(math.radians(y))) == pytest.approx(0.9 / 128 * math.pi)
+    said, _, _ = write(layers)
+    assert said["levels"]["L"]["vertices"][1][:2] == pytest.approx([201.8, -127.1], abs=1e-9)
+
+
+def test_an_edge_that_is_gone_leaves_a_one_way_lane() -> None:
+    layers, _ = read(sample("clinic"))
+    key = PartKey("topology", "Ground floor", "network")
+    network = part(layers, "topology", "Ground floor")
+    forward = network.index()["charger_1_ward: 3"]
+    said, _, _ = write(with_part(layers, key, network.take(np.arange(len(network)) != forward)))
+    lane = said["levels"]["Ground floor"]["lanes"][0]
+    assert lane[:2] == [6, 5]
+    assert lane[2]["bidirectional"] == [4, False]
+    assert lane[2]["orientation"] == [1, "backward"]
+
+
+def test_ways_of_different_speed_are_two_lanes() -> None:
+    layers, _ = read(sample("clinic"))
+    key = PartKey("topology", "Ground floor", "network")
+    network = part(layers, "topology", "Ground floor")
+    properties = list(network.properties)
+    k = network.index()["charger_1_ward: 3"]
+    properties[k] = {**properties[k], "speed_limit": 0.25}
+    changed = Features(network.ids, network.geometry, tuple(properties), network.local, network.document)
+    said, _, _ = write(with_part(layers, key, changed))
+    first, second = said["levels"]["Ground floor"]["lanes"][:2]
+    assert (first[:2], first[2]["speed_limit"], first[2]["bidirectional"]) == ([5, 6], [3, 0.25], [4, False])
+    assert (second[:2], second[2]["speed_limit"], second[2]["bidirectional"]) == ([6, 5], [3, 0.5], [4, False])
+
+
+def test_a_moved_node_leaves_its_walls_where_they_stood() -> None:
+    layers, _ = read(sample("clinic"))
+    key = PartKey("topology", "Ground floor", "network")
+    network = part(layers, "topology", "Ground floor")
+    geometry = network.geometry.copy()
+    geometry[network.index()["Ground floor/0"]] = shapely.Point(9.8, -9.8)
+    changed = Features(network.ids, geometry, network.properties, network.local, network.document)
+    said, _, told = write(with_part(layers, key, changed))
+    level = said["levels"]["Ground floor"]
+    assert level["vertices"][0][:2] == pytest.approx([100, 100])
+    assert level["walls"][0][:2] == [10, 1]
+    assert level["vertices"][10][:2] == pytest.approx([10, 10])
+    assert said["coordinate_system"] == "reference_image"
+    assert not told.warnings
+
+
+def test_a_changed_measurement_makes_it_metres_and_says_so() -> None:
+    layers, _ = read(sample("clinic"))
+    key = PartKey("objects", "Ground floor", "openrmf")
+    objects = part(layers, "objects", "Ground floor")
+    properties = list(objects.properties)
+    k = objects.index()["Ground floor/measurement/0"]
+    own = properties[k]["openrmf"]
+    properties[k] = {**properties[k], "openrmf": {**own, "parameters": {"distance": [3, 20]}}}
+    changed = Features(objects.ids, objects.geometry, tuple(properties), objects.local, objects.document)
+    said, _, told = write(with_part(layers, key, changed))
+    assert said["coordinate_system"] == "cartesian_meters"
+    assert said["levels"]["Upstairs"]["vertices"][0][:2] == pytest.approx([9.8, -4.41])
+    assert "drawing" not in said["levels"]["Ground floor"]
+    assert "no longer place level" in problems(told)
+    assert any("pixels" in line["what"] for line in told.dropped)
+
+
+def test_a_network_of_another_format_is_written_in_metres() -> None:
+    here = Datum(53.0, -0.5)
+    at = local_frame(here).to_wgs84(np.array([[0.0, 0.0], [10.0, 5.0], [20.0, 5.0]]))
+    rows: list[tuple[str, Any, dict[str, Any]]] = [
+        (f"n{k}", shapely.Point(xy), {"kind": "node", "osm": {"tags": {}}}) for k, xy in enumerate(at)
+    ]
+    for a, b in ((0, 1), (1, 0), (1, 2)):
+        line = shapely.LineString(at[[a, b]])
+        limit = {"speed_limit": 1.5} if a + b == 1 else {}
+        rows.append((f"w{a}{b}", line, {"kind": "edge", "source": f"n{a}", "target": f"n{b}", "width": 2.0, **limit}))
+    key = PartKey("topology", "ground", "network")
+    said, _, told = write(Layers({key: features(rows, "wgs84")}, here))
+    assert said["coordinate_system"] == "cartesian_meters"
+    level = said["levels"]["ground"]
+    assert [v[3] for v in level["vertices"]] == ["n0", "n1", "n2"]
+    assert level["vertices"][1][:2] == pytest.approx([10, 5], abs=1e-6)
+    assert [lane[:2] for lane in level["lanes"]] == [[0, 1], [1, 2]]
+    assert level["lanes"][0][2]["bidirectional"] == [4, True]
+    assert level["lanes"][0][2]["speed_limit"] == [3, 1.5]
+    assert level["lanes"][1][2] == {
+        "bidirectional": [4, False],
+        "graph_idx": [2, 0],
+        "orientation": [1, ""],
+        "speed_limit": [3, 0],
+    }
+    assert {line["what"] for line in told.dropped} >= {"edges' widths", "nodes' attributes of other formats"}
+    assert {line["what"] for line in told.template} == {"name", "lanes: parameters"}
+
+
+def test_a_network_on_a_level_of_its_own_stands_beside_a_building_in_pixels() -> None:
+    layers, _ = read(sample("clinic"))
+    node = features([("a", shapely.Point(3.0, 4.0), {"kind": "node"})], "local")
+    said, files, _ = write(with_part(layers, PartKey("topology", "roof", "network"), node))
+    assert said["coordinate_system"] == "reference_image"
+    assert list(said["levels"])[-1] == "roof"
+    again, _ = read({"x.building.yaml": files["building.yaml"]})
+    assert place(part(again, "topology", "roof"), "a") == pytest.approx([3.0, 4.0])
+
+
+def test_two_buildings_are_written_in_metres() -> None:
+    clinic, _ = read(sample("clinic"))
+    yard, _ = read(sample("yard"))
+    both = Layers({**clinic.parts, **yard.parts}, None, (*clinic.levels, *yard.levels))
+    said, _, told = write(both)
+    assert said["coordinate_system"] == "cartesian_meters"
+    assert said["levels"]["ground"]["vertices"][1][:2] == [12.5, -3.25]
+    assert said["levels"]["Ground floor"]["vertices"][5][:2] == pytest.approx([2.94, -2.94])
+    assert "different buildings" in problems(told)
+
+
+def test_a_building_without_vertices_is_a_map_of_its_own_format_only() -> None:
+    text = "name: m\ncoordinate_system: cartesian_meters\nlevels:\n  L:\n    elevation: 2\n    models:\n"
+    text += "      - {model_name: Bin, name: b, x: 1, y: 2, z: 0.5, yaw: 0}\n"
+    back = offline({"m.building.yaml": text.encode()}, "openrmf").files
+    model = yaml.safe_load(back["building.yaml"])["levels"]["L"]["models"][0]
+    assert model == {"model_name": "Bin", "name": "b", "x": 1.0, "y": 2.0, "z": 0.5, "yaw": 0.0}
+    with pytest.raises(MissingLayer):
+        offline({"m.building.yaml": text.encode()}, "tmap2")
+
+
+def test_rows_to_vertices_that_do_not_exist_are_kept_and_come_back() -> None:
+    text = "name: m\nlevels:\n  L:\n    elevation: 0\n    vertices: [[0, 0, 0, a], [1, 1, 0, b]]\n"
+    text += (
+        "    lanes: [[0, 7, {graph_idx: [2, 0]}], [0, 1, {graph_idx: [2, 0]}]]\n    floors: [{vertices: [0, 1, 9]}]\n"
+    )
+    layers, told = read(text)
+    assert "joins the vertices 0 and 7, but the level has 2" in problems(told)
+    said, _, warned = write(layers)
+    lanes = said["levels"]["L"]["lanes"]
+    assert lanes == [[0, 1, {"graph_idx": [2, 0]}], [0, 7, {"graph_idx": [2, 0]}]]
+    assert said["levels"]["L"]["floors"] == [{"vertices": [0, 1, 9]}]
+    assert "will refuse the file" in problems(warned)
+
+
+def test_without_measurements_and_fiducials_a_pixel_is_a_metre_with_a_warning() -> None:
+    text = "name: m\nlevels:\n  A: {elevation: 0, vertices: [[3, 4, 0, a]]}\n"
+    text += "  B: {elevation: 1, vertices: [[5, 6, 0, b]]}\n"
+    layers, told = read(text)
+    assert place(part(layers, "topology", "A"), "a") == [3, -4]
+    assert place(part(layers, "topology", "B"), "b") == [5, -6]
+    assert "no measurement tells the scale" in problems(told)
+    assert "fewer than two fiducials" in problems(told)
+
+
+LEVEL = "name: m\nlevels:\n  L:\n    elevation: 0\n"
+BROKEN = {
+    "levels: 3\nwalls: 1\n": "levels",
+    "name: m\nlevels: {}\n": "levels",
+    "- 1\n": "",
+    f"coordinate_system: polar\n{LEVEL}": "coordinate_system",
+    f"reference_level_name: X\n{LEVEL}": "reference_level_name",
+    f"{LEVEL}    vertices: [[1, 2], [3]]\n": "levels.L.vertices[1]",
+    f"{LEVEL}    vertices: [[1, x, 0, a]]\n": "levels.L.vertices[0][1]",
+    f"{LEVEL}    vertices: [[1, true, 0, a]]\n": "levels.L.vertices[0][1]",
+    f"{LEVEL}    vertices: [[1, 2, 0, [a]]]\n": "levels.L.vertices[0][3]",
+    f"{LEVEL}    vertices: [[1, 2, 0, a, 7]]\n": "levels.L.vertices[0][4]",
+    f"{LEVEL}    vertices: {{a: 1}}\n": "levels.L.vertices",
+    f"{LEVEL}    vertices: [[1, 2]]\n    walls: [[0, x]]\n": "levels.L.walls[0][1]",
+    f"{LEVEL}    lanes: [3]\n": "levels.L.lanes[0]",
+    f"{LEVEL}    lanes: [[0, 1, 5]]\n": "levels.L.lanes[0][2]",
+    f"{LEVEL}    models: [{{name: a, x: 1}}]\n": "levels.L.models[0].y",
+    f"{LEVEL}    models: [{{name: a, x: 1, y: 2, z: 1.0e+300}}]\n": "levels.L.models[0].z",
+    f"{LEVEL}    floors: [{{vertices: [a]}}]\n": "levels.L.floors[0].vertices[0]",
+    f"{LEVEL}    fiducials: [[1]]\n": "levels.L.fiducials[0]",
+    f"{LEVEL}lifts: {{a: {{x: 1}}}}\n": "lifts.a.y",
+    f"{LEVEL}    vertices: [[0, 0], [1.0e-300, 0]]\n    measurements: [[0, 1, {{distance: [3, 9]}}]]\n": (
+        "levels.L.measurements"
+    ),
+}
+
+
+@pytest.mark.parametrize("text", BROKEN)
+def test_what_is_wrong_is_named(text: str) -> None:
+    with pytest.raises(UnreadableFile) as caught:
+        read(text)
+    assert caught.value.problems[0].where == (BROKEN[text] or None)
+    assert caught.value.problems[0].file == "a.building.yaml"
+
+
+def test_far_places_and_many_fiducials_are_refused() -> None:
+    with pytest.raises(BadUpload):
+        read(f"{LEVEL}    vertices: [[1.0e+300, 2, 0, a]]\n")
+    marks = ", ".join("[1, 2, a]" for _ in range(500))
+    with pytest.raises(UnreadableFile, match="fiducials in common"):
+        read(f"name: m\nlevels:\n  A: {{fiducials: [{marks}]}}\n  B: {{fiducials: [{marks}]}}\n")
+
+
+def test_only_wanted_layers_are_given() -> None:
+    layers, _ = read(sample("clinic"), wanted=frozenset({"topology"}))
+    assert {key.layer for key in layers.parts} == {"topology"}
+    assert not any(isinstance(p, Resources) for p in layers.parts.values())
+
+
+def test_other_yaml_is_not_taken_for_a_building() -> None:
+    samples = SAMPLES.parent
+    for folder in ("tmap2", "datum", "occupancy_grid", "rmf_nav_graph"):
+        for path in (samples / folder).rglob("*"):
+            if path.is_file():
+                assert not FORMAT.detect(path.name, path.read_bytes()), path
+    assert not FORMAT.detect("x.project.yaml", b"building:\n  filename: a.building.yaml\nname: a\nversion: 1\n")
+
+
+def test_a_large_building_is_read_and_written_in_bounded_time() -> None:
+    n = 5000
+    vertices = "".join(f'      - [{k}, {k % 7}, 0, ""]\n' for k in range(n))
+    lanes = "".join(
+        f'      - [{k}, {k + 1}, {{bidirectional: [4, true], graph_idx: [2, 0], orientation: [1, ""]}}]\n'
+        for k in range(n - 1)
+    )
+    layers, _ = read(f"{LEVEL}    lanes:\n{lanes}    vertices:\n{vertices}", limits=Limits())
+    said, _, _ = write(layers)
+    assert len(said["levels"]["L"]["lanes"]) == n - 1
