@@ -24,6 +24,7 @@ KINDS = {
     "osm_xml": "osm",
     "occupancy_map_yaml": "occupancy_grid",
     "openrmf_building": "openrmf",
+    "rmf_nav_graph": "rmf_nav_graph",
 }
 
 REFUSED = {

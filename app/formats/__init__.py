@@ -144,7 +144,7 @@ class Format:
     layer (the upload's ``layer`` says which). rank: of two files that tell the same network, the higher one wins.
     version: raise it when the same layers give other bytes (it is part of every ETag). choose: of the parts that it
     carries, those that these options ask for. by_file: the options that a wanted file's name says. outlines: it writes
-    where grids lie, not their cells.
+    where grids lie, not their cells. joined: its main files of one folder are one map (graphs 0.yaml, 1.yaml …).
     """
 
     name: str
@@ -167,6 +167,7 @@ class Format:
     choose: Callable[[Sequence[PartKey], Any], Sequence[PartKey]] = lambda keys, options: keys
     by_file: Callable[[str], Mapping[str, str]] = lambda name: {}
     outlines: bool = False
+    joined: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,8 +237,17 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
         groups = [(asked, main or next(iter(sorted(files))))]
     out = []
     mains = {main for _, main in groups}
+    joined: dict[tuple[str, str], list[str]] = {}
+    for known, main in groups:
+        if known.joined:
+            joined.setdefault((known.name, main.rpartition("/")[0]), []).append(main)
     for known, main in groups:
         others = [n for n in known.companions(main, files[main], sorted(files)) if n in files and n not in mains]
+        if known.joined:
+            first, *further = joined[known.name, main.rpartition("/")[0]]
+            if main != first:
+                continue
+            others += further
         used.update([main, *others])
         out.append(Group(known, main, {n: files[n] for n in [main, *others]}))
     return out, sorted(set(files) - used)

@@ -1,0 +1,729 @@
+"""0.yaml, 1.yaml …: the navigation graphs of Open-RMF's fleet adapters, one for each kind of robot.
+
+``{building_name, levels: {level: {vertices: [[x, y, {name, …}]], lanes: [[i, j, {…}]]}}, doors: {name: {endpoints,
+map}}, lifts: {name: {position: [x, y, yaw], dims: [width, depth]}}}`` in metres; lanes are directed. They are made from
+a building as ``building_map_generator nav`` does it: the vertices that lanes of the graph use, in order of first use; a
+two-way lane as two; ``door_name`` where a lane crosses a door, ``lift`` where a vertex lies in a lift's shaft,
+``orientation_constraint``, ``speed_limit``, ``mutex``, ``dock_name`` and ``undock_name``.
+
+Source: open-rmf/rmf_traffic_editor, rmf_building_map_tools/building_map (building.py, level.py, lift.py).
+
+Canonical: the graphs of a folder are one network for each level. A vertex that several graphs list alike is one node;
+``properties.rmf_nav_graph`` keeps its place in each graph (``graphs``) and its ``parameters``, an edge's ``graph``,
+``index`` and ``parameters``. Doors and lifts are objects. The document's ``rmf_nav_graph`` holds what each graph says
+at its top level.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import orjson
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import MissingLayer
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _rmf, _yaml, register
+from app.formats._rmf import (
+    BUILDING,
+    CABIN_HEIGHT,
+    MAX_GRAPHS,
+    NAV_GRAPH,
+    Array,
+    Flow,
+    index,
+    listing,
+    mapping,
+    number,
+    own,
+    refuse,
+    value_of,
+)
+from app.formats._text import METRES, numbers
+from app.model.features import Features, Properties, features, from_columns, points, segments, unique_ids
+from app.model.frame import GROUND
+from app.model.layers import NETWORK, Layers, Part, PartKey
+
+NAME = NAV_GRAPH
+SHAFT_GAP = 0.05
+"""Metres between a lift's cabin and its shaft on each side; a vertex in the shaft belongs to the lift."""
+
+PARALLEL = 0.01
+"""rmf_building_map_tools takes a lane and a door for parallel where the determinant of their directions is smaller, in
+the units of the building's file."""
+
+LANE_WORDS = ("mutex", "demo_mock_floor_name", "demo_mock_lift_name")
+"""A building's lane parameters that a graph takes over as they are, where they are not empty."""
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Level:
+    """A level as all graphs together tell it."""
+
+    nodes: dict[bytes, int] = field(default_factory=dict)
+    at: list[tuple[float, float]] = field(default_factory=list)
+    nodes_say: list[dict[str, Any]] = field(default_factory=list)
+    edges: list[tuple[int, int, dict[str, Any]]] = field(default_factory=list)
+    objects: list[tuple[str, Any, Properties]] = field(default_factory=list)
+    rest: dict[str, Any] = field(default_factory=dict)
+    dangling: dict[str, list[Any]] = field(default_factory=dict)
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """All graphs as topology and objects by level; local metres. Raises UnreadableFile naming the place."""
+    graphs = _graphs(files, context)
+    levels: dict[str, _Level] = {}
+    tops: dict[str, Any] = {}
+    doors: dict[str, tuple[Any, list[int], int]] = {}
+    lifts: dict[str, tuple[Any, list[int], int]] = {}
+    for graph, top in graphs.items():
+        tops[str(graph)] = {key: value for key, value in top.items() if key not in ("levels", "doors", "lifts")}
+        for name, said in mapping(top.get("levels"), "levels").items():
+            _level(levels.setdefault(name, _Level()), graph, mapping(said, f"levels.{name}"), f"levels.{name}", context)
+        _collect(doors, mapping(top.get("doors"), "doors"), graph, context, "doors")
+        _collect(lifts, mapping(top.get("lifts"), "lifts"), graph, context, "lifts")
+    if not levels:
+        refuse("a navigation graph needs at least one level", "levels")
+    if context.level != GROUND:
+        context.warn(f"its levels have names of their own: level={context.level} is not used", where="levels")
+    for name, (said, inside, k) in doors.items():
+        _door(levels, name, said, {"index": k, **_partly(inside, graphs)})
+    for name, (said, inside, k) in lifts.items():
+        _lift(levels, name, said, {"index": k, **_partly(inside, graphs)})
+    parts: dict[PartKey, Part] = {}
+    taken: set[str] = set()
+    for name, level in levels.items():
+        document: dict[str, Any] = {"graphs": tops}
+        if level.rest:
+            document["level"] = level.rest
+        if level.dangling:
+            document["dangling"] = level.dangling
+        network = _network(name, level, taken).with_document({NAME: document})
+        parts[PartKey("topology", name, NETWORK)] = network
+        if not len(network):  # a level without a node is one of this format alone, and of no other
+            parts[PartKey("topology", name, NAME)] = network
+        if level.objects:
+            parts[PartKey("objects", name, NAME)] = features(level.objects, "local", {NAME: document})
+    return Layers({key: part for key, part in parts.items() if context.wants(key.layer)})
+
+
+def _graphs(files: Files, context: ReadContext) -> dict[int, dict[str, Any]]:
+    """The files by graph number: that of their name, else the next free one."""
+    out: dict[int, dict[str, Any]] = {}
+    named = sorted(files, key=lambda name: (not _stem(name).isdigit(), len(_stem(name)), name))
+    for name in named:
+        context.main = name
+        top = _yaml.load(files[name], context.limits)
+        if not isinstance(top, dict):
+            refuse("must be a mapping with levels", "")
+        stem = _stem(name)
+        wanted = int(stem) if stem.isdecimal() and stem.isascii() and len(stem) < 5 else None
+        graph = wanted if wanted is not None and wanted not in out else next(k for k in range(10**6) if k not in out)
+        if wanted is None:
+            context.warn(f"its name is no number: it is taken as graph {graph}")
+        out[graph] = top
+    return out
+
+
+def _stem(name: str) -> str:
+    return name.rpartition("/")[2].partition(".")[0]
+
+
+def _level(level: _Level, graph: int, said: Mapping[str, Any], where: str, context: ReadContext) -> None:
+    rows = listing(said.get("vertices"), f"{where}.vertices")
+    places: list[int] = []
+    for k, (row, (x, y)) in enumerate(zip(rows, _rmf.places(rows, f"{where}.vertices").tolist(), strict=True)):
+        parameters = mapping(row[2] if len(row) > 2 else None, f"{where}.vertices[{k}][2]")
+        # A graph may list twins; of other graphs each vertex is found again by what it says.
+        key = orjson.dumps((x, y, parameters, row[3:]), option=orjson.OPT_SORT_KEYS)
+        place = level.nodes.get(key)
+        if place is None or str(graph) in level.nodes_say[place]["graphs"]:
+            place = len(level.at)
+            level.nodes.setdefault(key, place)
+            level.at.append((x, y))
+            more = {"more": row[3:]} if len(row) > 3 else {}
+            level.nodes_say.append({"graphs": {}, "parameters": parameters, **more})
+        level.nodes_say[place]["graphs"][str(graph)] = k
+        places.append(place)
+    for k, row in enumerate(listing(said.get("lanes"), f"{where}.lanes")):
+        at = f"{where}.lanes[{k}]"
+        if not isinstance(row, list) or len(row) < 2:
+            refuse("must be a list [vertex, vertex, {…}]", at)
+        i, j = index(row[0], f"{at}[0]"), index(row[1], f"{at}[1]")
+        parameters = mapping(row[2] if len(row) > 2 else None, f"{at}[2]")
+        if not (0 <= i < len(rows) and 0 <= j < len(rows)):
+            level.dangling.setdefault(str(graph), []).append(row)
+            problem = f"joins the vertices {i} and {j}, but the level has {len(rows)}: it is kept in the document"
+            context.warn(problem, where=at)
+            continue
+        more = {"more": row[3:]} if len(row) > 3 else {}
+        rest = {"graph": graph, "index": k, "parameters": parameters, **more}
+        level.edges.append((places[i], places[j], rest))
+        if parameters.get("is_bidirectional") is True:
+            level.edges.append((places[j], places[i], {**rest, "reverse": True}))
+    rest = {key: value for key, value in said.items() if key not in ("vertices", "lanes")}
+    if rest:
+        level.rest[str(graph)] = rest
+
+
+def _collect(
+    known: dict[str, tuple[Any, list[int], int]],
+    said: Mapping[str, Any],
+    graph: int,
+    context: ReadContext,
+    section: str,
+) -> None:
+    """Doors or lifts of one graph, beside those of the graphs before it."""
+    for name, one in said.items():
+        if name not in known:
+            known[name] = (one, [graph], len(known))
+            continue
+        known[name][1].append(graph)
+        if known[name][0] != one:
+            context.warn("differs from what an earlier graph says, which is kept", where=f"{section}.{name}")
+
+
+def _partly(inside: list[int], graphs: Mapping[int, Any]) -> dict[str, Any]:
+    return {} if len(inside) == len(graphs) else {"graphs": inside}
+
+
+def _door(levels: Mapping[str, _Level], name: str, said: Any, rest: dict[str, Any]) -> None:
+    where = f"doors.{name}"
+    one = dict(mapping(said, where))
+    ends = listing(one.pop("endpoints", None), f"{where}.endpoints")
+    if len(ends) != 2:
+        refuse("must be two points", f"{where}.endpoints")
+    at = _rmf.places(ends, f"{where}.endpoints")
+    level = one.pop("map", None)
+    if level not in levels:
+        one["map"] = level
+        level = next(iter(levels))
+    properties = {"kind": "door", "name": name, NAME: {**rest, "says": one}}
+    levels[str(level)].objects.append((f"{level}/door/{_rmf.short(name)}", shapely.LineString(at), properties))
+
+
+def _lift(levels: Mapping[str, _Level], name: str, said: Any, rest: dict[str, Any]) -> None:
+    where = f"lifts.{name}"
+    one = dict(mapping(said, where))
+    position = listing(one.pop("position", None), f"{where}.position")
+    dims = listing(one.pop("dims", None), f"{where}.dims")
+    if len(position) < 2 or len(dims) != 2:
+        refuse("needs position [x, y, yaw] and dims [width, depth]", where)
+    x, y, yaw = (number(v, f"{where}.position") for v in [*position, 0.0][:3])
+    size = [*(number(v, f"{where}.dims") for v in dims), CABIN_HEIGHT]
+    level = next(iter(levels))
+    properties: dict[str, Any] = {"kind": "lift", "name": name, "pose": [x, y, 0.0, 0.0, 0.0, yaw], "size": size}
+    row = (f"{level}/lift/{_rmf.short(name)}", shapely.Point(x, y), {**properties, NAME: {**rest, "says": one}})
+    levels[level].objects.append(row)
+
+
+def _network(name: str, level: _Level, taken: set[str]) -> Features:
+    properties: list[Properties] = []
+    wanted = []
+    for k, rest in enumerate(level.nodes_say):
+        called = rest["parameters"].get("name")
+        said: dict[str, Any] = {"kind": "node"}
+        if isinstance(called, str) and called:
+            said["name"] = called
+            rest["parameters"] = {key: value for key, value in rest["parameters"].items() if key != "name"}
+        properties.append({**said, NAME: rest})
+        wanted.append(_rmf.short(called) if "name" in said else f"{_rmf.short(name, 200)}/{k}")
+    ids = unique_ids(wanted, taken)
+    taken.update(ids)
+    at = np.array(level.at, np.float64).reshape(-1, 2)
+    sources, targets = [i for i, _, _ in level.edges], [j for _, j, _ in level.edges]
+    edges = [_rmf.short(f"{ids[i]}_{ids[j]}", 490) for i, j in zip(sources, targets, strict=True)]
+    edges = unique_ids(edges, taken)
+    taken.update(edges)
+    for i, j, rest in level.edges:
+        said = {"kind": "edge", "source": ids[i], "target": ids[j], NAME: rest}
+        limit = _limit(rest["parameters"])
+        if limit:
+            said["speed_limit"] = limit
+        properties.append(said)
+    lines = segments(at[sources], at[targets]) if sources else np.empty(0, object)
+    return from_columns([*ids, *edges], np.concatenate([points(at), lines]), properties, "local")
+
+
+def _limit(parameters: Mapping[str, Any]) -> float:
+    said = parameters.get("speed_limit")
+    good = isinstance(said, (int, float)) and not isinstance(said, bool) and said > 0
+    return float(said) if good and said is not None else 0.0
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Door:
+    name: str
+    level: str
+    ends: Array
+    graphs: list[int] | None
+    says: dict[str, Any]
+
+
+@dataclass(slots=True)
+class _Lift:
+    """corners: float64 [4, 2] of the shaft; levels: those that it serves."""
+
+    name: str
+    position: tuple[float, float, float]
+    dims: tuple[float, float]
+    corners: Array
+    levels: frozenset[str]
+    graphs: list[int] | None
+    says: dict[str, Any]
+
+
+@dataclass(slots=True)
+class _Edge:
+    order: tuple[bool, int, bool, int, str]
+    source: int
+    target: int
+    p: Properties
+    paired: bool = False
+
+
+@dataclass(slots=True)
+class _Storey:
+    """A level being written. at: float64 [n, 2] metres of its nodes; edges by graph."""
+
+    name: str
+    ids: list[str]
+    nodes: list[Properties]
+    at: Array
+    edges: dict[int, list[_Edge]]
+    document: dict[str, Any]
+    parallel: float
+    lifts: list[str | None] = field(default_factory=list)
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """One file for each graph that has lanes, ``0.yaml`` first. Raises MissingLayer where none has."""
+    return _Writer(layers, context).files()
+
+
+class _Writer:
+    """All graphs of an environment."""
+
+    def __init__(self, layers: Layers, context: WriteContext) -> None:
+        self.layers, self.context = layers, context
+        self.flow = Flow()
+        self.lost: Counter[str] = Counter()
+        self.building, self.tops = self._documents()
+        self.doors, self.lifts = self._doors(), self._lifts()
+        self.storeys = self._storeys()
+
+    def _documents(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What a building says at its top level, and what each graph does."""
+        building: dict[str, Any] = {}
+        tops: dict[str, Any] = {}
+        for part in [*self.layers.vector("topology").values(), *self.layers.vector("objects").values()]:
+            said = part.document.get(BUILDING)
+            if isinstance(said, dict) and not building:
+                building = mapping(said.get("building"), "building")
+            said = part.document.get(NAME)
+            if isinstance(said, dict) and not tops:
+                tops = mapping(said.get("graphs"), "graphs")
+        return building, tops
+
+    def files(self) -> dict[str, bytes]:
+        """The graphs by file name."""
+        graphs = sorted({g for s in self.storeys for g in s.edges} | {int(g) for g in self.tops if g.isdecimal()})
+        if not graphs:
+            raise MissingLayer(
+                "rmf_nav_graph needs lanes, and no node has an edge: supply a network (building.yaml, tmap2, OSM …)"
+            )
+        out = {f"{graph}.yaml": self._graph(graph).encode() for graph in graphs}
+        self._count_left_out()
+        for what, count in sorted(self.lost.items()):
+            self.context.drop(what, count, "a navigation graph has no place for it")
+        if self.building.get("coordinate_system") in ("wgs84", "web_mercator"):
+            self.context.warn(
+                "the building is drawn on earth: its graphs are in metres of the environment's local frame, not in the "
+                "coordinates of generate_crs",
+                where="coordinate_system",
+            )
+        return out
+
+    def _count_left_out(self) -> None:
+        for storey in self.storeys:
+            used = {k for edges in storey.edges.values() for e in edges for k in (e.source, e.target)}
+            listed = {k for k, p in enumerate(storey.nodes) if NAME in p}
+            self.lost["nodes without lanes"] += len(storey.nodes) - len(used | listed)
+        for key, part in self.layers.vector("objects").items():
+            if key.name in (BUILDING, NAME):
+                rest = sum(p.get("kind") not in ("door", "lift") for p in part.properties)
+                self.lost["objects that are neither door nor lift"] += rest
+
+    # what is there
+
+    def _items(self, kind: str) -> Iterable[tuple[str, str, Properties, Any, Mapping[str, Any]]]:
+        """(level, id, properties, geometry in metres, document) of the doors or lifts, in their files' order."""
+        for key, part in self.layers.vector("objects").items():
+            if key.name not in (BUILDING, NAME):
+                continue
+            chosen = part.of_kind(kind)
+            geometry = chosen.in_local(self.layers.frame)
+            rows = list(zip(chosen.ids, chosen.properties, geometry, strict=True))
+            rows.sort(key=lambda row: (_place(row[1]), row[0]))
+            for i, p, g in rows:
+                yield key.level, i, p, g, part.document
+
+    def _doors(self) -> list[_Door]:
+        out = []
+        names: set[str] = set()
+        for level, i, p, g, _ in self._items("door"):
+            name = str(p.get("name") or i)
+            if int(shapely.get_type_id(g)) != 1 or g.is_empty or name in names:
+                self.lost["doors without two ends, or of a name that another one has"] += 1
+                continue
+            names.add(name)
+            rest = own(p, NAME)
+            inside = rest.get("graphs") if isinstance(rest.get("graphs"), list) else None
+            out.append(_Door(name, level, _rmf.ends(g), inside, mapping(rest.get("says"), "says")))
+        return out
+
+    def _lifts(self) -> list[_Lift]:
+        found = []
+        names: set[str] = set()
+        for _, i, p, g, _ in self._items("lift"):
+            name = str(p.get("name") or i)
+            if int(shapely.get_type_id(g)) != 0 or g.is_empty or name in names:
+                self.lost["lifts without a point, or of a name that another one has"] += 1
+                continue
+            names.add(name)
+            said = mapping(own(p, BUILDING).get("says"), "says")
+            pose, size = _rmf.pose_of(p), _rmf.size_of(p) or (1.0, 1.0)
+            yaw = pose[5] if pose else said.get("yaw", 0.0)
+            yaw = float(yaw) if isinstance(yaw, (int, float)) else 0.0
+            rest = own(p, NAME)
+            inside = rest.get("graphs") if isinstance(rest.get("graphs"), list) else None
+            position = (float(g.x), float(g.y), yaw)
+            says = mapping(rest.get("says"), "says")
+            served = self._served(said)
+            lift = _Lift(name, position, size, _shaft(position, size), served, inside, says)
+            found.append((_place(p), name, lift))
+        found.sort(key=lambda row: row[:2])
+        return [lift for _, _, lift in found]
+
+    def _served(self, said: Mapping[str, Any]) -> frozenset[str]:
+        """The levels between a lift's lowest and highest floor; none where it has no door on any."""
+        if not said.get("level_doors"):
+            return frozenset()
+        known = {level.name: level.elevation for level in self.layers.levels}
+        low = known.get(str(said.get("lowest_floor") or ""), -math.inf)
+        high = known.get(str(said.get("highest_floor") or ""), math.inf)
+        names = {key.level for key in self.layers.vector("topology")}
+        return frozenset(name for name in names if low <= known.get(name, 0.0) <= high)
+
+    def _storeys(self) -> list[_Storey]:
+        by_level: dict[str, list[Features]] = {}
+        for key, part in self.layers.vector("topology").items():
+            if len(part) or NAME in part.document or BUILDING in part.document:
+                by_level.setdefault(key.level, []).append(part)
+        out = []
+        for level, networks in sorted(by_level.items()):
+            ids: list[str] = []
+            nodes: list[Properties] = []
+            at: list[Array] = []
+            documents: dict[str, Any] = {}
+            for part in networks:
+                documents = {**part.document, **documents}
+                point = (shapely.get_type_id(part.geometry) == 0) & ~shapely.is_empty(part.geometry)
+                where = [k for k, p in enumerate(part.properties) if p.get("kind") == "node" and point[k]]
+                ids += [part.ids[k] for k in where]
+                nodes += [part.properties[k] for k in where]
+                at.append(shapely.get_coordinates(part.take(where).in_local(self.layers.frame)))
+            places = {i: k for k, i in reversed(list(enumerate(ids)))}
+            edges = self._edges(networks, places)
+            document = mapping(documents.get(NAME), NAME)
+            scale = mapping(documents.get(BUILDING), BUILDING).get("transform")
+            factor = float(scale[0]) ** 2 if isinstance(scale, list) and scale else 1.0
+            storey = _Storey(level, ids, nodes, np.concatenate(at), edges, document, PARALLEL * factor)
+            storey.lifts = self._inside(storey)
+            out.append(storey)
+        return out
+
+    def _inside(self, storey: _Storey) -> list[str | None]:
+        """The first lift whose shaft each node lies in."""
+        out: list[str | None] = [None] * len(storey.ids)
+        for lift in reversed(self.lifts):
+            if storey.name in lift.levels:
+                a = lift.corners[None] - storey.at[:, None]
+                b = np.roll(lift.corners, 1, axis=0) - lift.corners
+                cross = a[..., 0] * b[:, 1] - a[..., 1] * b[:, 0]
+                inside = (cross >= 0).all(axis=1) | (cross <= 0).all(axis=1)
+                for k in np.flatnonzero(inside).tolist():
+                    out[k] = lift.name
+        return out
+
+    def _edges(self, networks: Sequence[Features], places: Mapping[str, int]) -> dict[int, list[_Edge]]:
+        """The edges of a level by graph, in the order of their lanes."""
+        out: dict[int, list[_Edge]] = {}
+        for part in networks:
+            bends = shapely.get_num_coordinates(part.geometry)
+            for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
+                if p.get("kind") == "node":
+                    continue
+                source, target = places.get(str(p.get("source"))), places.get(str(p.get("target")))
+                graph = _graph_of(p)
+                if p.get("kind") != "edge" or source is None or target is None:
+                    self.lost["edges without two nodes on their level"] += 1
+                elif graph is None:
+                    self.lost[f"lanes of graphs that are not 0 to {MAX_GRAPHS - 1}"] += 1
+                else:
+                    self.lost["edges' bends between their nodes"] += int(bends[k] > 2)
+                    self.lost["edges' actions"] += p.get("action") is not None
+                    self.lost["edges' widths"] += p.get("width") is not None
+                    if NAME not in p and BUILDING not in p:
+                        self.lost["edges' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
+                    rest = own(p, NAME) or own(p, BUILDING)
+                    was = rest.get("index")
+                    known = isinstance(was, int)
+                    order = (not known, was if isinstance(was, int) else 0, rest.get("reverse") is True, len(i), i)
+                    out.setdefault(graph, []).append(_Edge(order, source, target, p))
+        for edges in out.values():
+            edges.sort(key=lambda e: e.order)
+            there = Counter((e.target, e.source, _lane_of(e.p)) for e in edges)
+            for e in edges:
+                e.paired = e.source != e.target and there[e.source, e.target, _lane_of(e.p)] > 0
+        return out
+
+    # a graph
+
+    def _graph(self, graph: int) -> str:
+        top = dict(mapping(self.tops.get(str(graph)), "graphs"))
+        if "building_name" not in top:
+            name = self.building.get("building_name", self.building.get("name"))
+            top["building_name"] = self.context.title if name is None else name
+            if name is None:
+                self.context.fill("building_name", self.context.title, "no source names the building")
+        if self.building.get("coordinate_system") == "cartesian_meters":
+            parameters = self.building.get("parameters")
+            top.setdefault("offset", [value_of(parameters, key, 0) for key in ("offset_x", "offset_y")])
+            if value_of(parameters, "generate_crs") is not None:
+                top.setdefault("crs_name", value_of(parameters, "generate_crs"))
+        names: Counter[str] = Counter()
+        levels = "".join(self._level(storey, graph, names) for storey in self.storeys)
+        twice = sorted(name for name, count in names.items() if count > 1)
+        if twice:
+            listed = ", ".join(twice[:5]) + (" …" if len(twice) > 5 else "")
+            problem = f"{len(twice)} names stand for several vertices, which fleet adapters refuse: {listed}"
+            self.context.warn(problem, file=f"{graph}.yaml", where="levels")
+        doors = {
+            d.name: {"endpoints": _rounded(d.ends), "map": d.level, **d.says}
+            for d in self.doors
+            if d.graphs is None or graph in d.graphs
+        }
+        lifts = {
+            lift.name: {"dims": list(lift.dims), "position": _rounded(np.array(lift.position)), **lift.says}
+            for lift in self.lifts
+            if lift.graphs is None or graph in lift.graphs
+        }
+        before = {**{k: v for k, v in top.items() if k < "levels"}, "doors": doors}
+        after = {**{k: v for k, v in top.items() if k > "levels"}, "lifts": lifts}
+        return f"{_yaml.mapping(before, 0)}levels:\n{levels}{_yaml.mapping(after, 0)}"
+
+    def _level(self, storey: _Storey, graph: int, names: Counter[str]) -> str:
+        edges = storey.edges.get(graph, [])
+        listed = [(own(p, NAME).get("graphs") or {}).get(str(graph)) for p in storey.nodes]
+        order = sorted((k for k, at in enumerate(listed) if isinstance(at, int)), key=lambda k: (listed[k], k))
+        order = list(dict.fromkeys([*order, *(k for e in edges for k in (e.source, e.target))]))
+        place = {k: n for n, k in enumerate(order)}
+        texts = list(map(_yaml.decimal, numbers(storey.at[order].ravel(), METRES)))
+        vertices = []
+        for n, k in enumerate(order):
+            said = self._vertex(storey, k)
+            names[str(said["name"])] += bool(said.get("name"))
+            more = "".join(f", {self.flow(v)}" for v in own(storey.nodes[k], NAME).get("more") or ())
+            vertices.append(f"      - [{texts[2 * n]}, {texts[2 * n + 1]}, {self.flow(said)}{more}]\n")
+        crossed = self._crossed(storey, edges)
+        lanes = []
+        for n, e in enumerate(edges):
+            if own(e.p, NAME).get("reverse") is True and e.paired:
+                continue  # it is told by the lane that says is_bidirectional
+            more = "".join(f", {self.flow(v)}" for v in own(e.p, NAME).get("more") or ())
+            said = self._lane(storey, e, crossed[n])
+            lanes.append(f"      - [{place[e.source]}, {place[e.target]}, {self.flow(said)}{more}]\n")
+        for row in mapping(storey.document.get("dangling"), "dangling").get(str(graph), ()):
+            if all(0 <= v < len(order) for v in row[:2]):
+                self.lost["lanes to vertices that did not exist"] += 1
+            else:
+                lanes.append(f"      - {self.flow(row)}\n")
+                problem = "a lane joins vertices that do not exist: fleet adapters will refuse the graph"
+                self.context.warn(problem, file=f"{graph}.yaml", where=f"levels.{storey.name}.lanes")
+        out = [f"  {_yaml.text(storey.name)}:\n"]
+        for key, rows in (("lanes", lanes), ("vertices", vertices)):
+            out += [f"    {key}:\n", *rows] if rows else [f"    {key}: []\n"]
+        rest = mapping(mapping(storey.document.get("level"), "level").get(str(graph)), "level")
+        out.append(_yaml.mapping(rest, 4) if rest else "")
+        return "".join(out)
+
+    def _vertex(self, storey: _Storey, k: int) -> dict[str, Any]:
+        p = storey.nodes[k]
+        if NAME in p:
+            said = dict(mapping(own(p, NAME).get("parameters"), "parameters"))
+            name = p.get("name")
+            if isinstance(name, str) or "name" not in said:
+                said["name"] = name or ""
+            return said
+        if BUILDING in p:
+            parameters = mapping(own(p, BUILDING).get("parameters"), "parameters")
+            said = {"name": p.get("name") or ""}
+            said |= {key: value_of(parameters, key, value) for key, value in parameters.items()}
+        else:
+            self.lost["nodes' orientations"] += p.get("orientation") is not None
+            self.lost["nodes' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
+            said = {"name": p.get("name") or storey.ids[k]}
+        if storey.lifts[k] is not None:
+            said["lift"] = storey.lifts[k]
+        return said
+
+    def _lane(self, storey: _Storey, e: _Edge, door: str | None) -> dict[str, Any]:
+        limit = _rmf.limit(e.p)
+        if NAME in e.p:
+            said = dict(mapping(own(e.p, NAME).get("parameters"), "parameters"))
+            if _limit(said) != limit:
+                said["speed_limit"] = limit
+            if said.get("is_bidirectional") is True and not e.paired:
+                said["is_bidirectional"] = False
+            return said
+        said = {}
+        if door is not None:
+            said["door_name"] = door
+        if limit:
+            said["speed_limit"] = limit
+        rest = own(e.p, BUILDING)
+        parameters = rest.get("parameters")
+        orientation = value_of(parameters, "orientation")
+        if orientation:
+            turned = _rmf.turned(orientation) if orientation in ("forward", "backward") else ""
+            said["orientation_constraint"] = turned if rest.get("reverse") is True else orientation
+        for key in LANE_WORDS:
+            if value_of(parameters, key):
+                said[key] = value_of(parameters, key)
+        for word, k in (("dock_name", e.target), ("undock_name", e.source)):
+            dock = value_of(own(storey.nodes[k], BUILDING).get("parameters"), "dock_name")
+            if dock:
+                said[word] = dock
+        if not e.paired:
+            said["is_bidirectional"] = False
+        return said
+
+    def _crossed(self, storey: _Storey, edges: Sequence[_Edge]) -> list[str | None]:
+        """The door that each edge leads through; of several the last."""
+        out: list[str | None] = [None] * len(edges)
+        doors = [d for d in self.doors if d.level == storey.name]
+        if not edges or not doors:
+            return out
+        a = storey.at[[e.source for e in edges]]
+        b = storey.at[[e.target for e in edges]]
+        tree = shapely.STRtree(segments(a, b))
+        for door in doors:
+            near = np.sort(tree.query(shapely.LineString(door.ends)))
+            for k in near[_meet(a[near], b[near], door.ends, storey.parallel)].tolist():
+                out[k] = door.name
+        return out
+
+
+def _meet(a: Array, b: Array, door: Array, parallel: float) -> NDArray[np.bool_]:
+    """Which of the segments a-b [n, 2] meet the door [2, 2], ends included; parallel ones do not."""
+    c, d = door
+    u, v = a - b, c - d
+    det = u[:, 0] * v[1] - u[:, 1] * v[0]
+    w = a - c
+    safe = np.where(np.abs(det) < parallel, 1.0, det)
+    t = (w[:, 0] * v[1] - w[:, 1] * v[0]) / safe
+    s = -(u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / safe
+    inside = (t >= 0) & (t <= 1) & (s >= 0) & (s <= 1)
+    return np.asarray(inside & (np.abs(det) >= parallel), np.bool_)
+
+
+def _shaft(position: tuple[float, float, float], dims: tuple[float, float]) -> Array:
+    """The corners of a lift's shaft, float64 [4, 2]."""
+    x, y, yaw = position
+    w, d = dims[0] / 2 + SHAFT_GAP, dims[1] / 2 + SHAFT_GAP
+    across = np.array([math.cos(yaw), math.sin(yaw)]) * w
+    along = np.array([-math.sin(yaw), math.cos(yaw)]) * d
+    corners = np.array([along - across, -along - across, across - along, across + along])
+    return np.asarray(corners + np.array([x, y]), np.float64)
+
+
+def _place(p: Properties) -> int:
+    at = (own(p, BUILDING) or own(p, NAME)).get("index")
+    return at if isinstance(at, int) else 2**62
+
+
+def _graph_of(p: Properties) -> int | None:
+    """The graph of an edge; None for a lane of a building that is in none."""
+    if NAME in p:
+        graph = own(p, NAME).get("graph")
+        return graph if isinstance(graph, int) and graph >= 0 else 0
+    graph = value_of(own(p, BUILDING).get("parameters"), "graph_idx", 0)
+    if isinstance(graph, bool) or not isinstance(graph, int):
+        return 0
+    return graph if 0 <= graph < MAX_GRAPHS else None
+
+
+def _lane_of(p: Properties) -> Any:
+    """What two edges of one two-way lane have in common."""
+    if NAME in p:
+        return own(p, NAME).get("index") if own(p, NAME).get("parameters", {}).get("is_bidirectional") is True else None
+    return own(p, BUILDING).get("index")
+
+
+def _rounded(values: Array) -> Any:
+    return (np.round(values, METRES) + 0.0).tolist()
+
+
+# --- the format ------------------------------------------------------------------------------------------------------
+
+_TOP = re.compile(rb"(?m)^building_name[ \t]*:")
+_LEVELS = re.compile(rb"(?m)^levels[ \t]*:")
+_OF_BUILDING = re.compile(
+    rb"(?m)^(?:coordinate_system|crowd_sim|reference_level_name)[ \t]*:"
+    rb"|^[ \t]+(?:walls|measurements|drawing|elevation|floors|fiducials|models|human_lanes|flattened_x_offset)[ \t]*:"
+)
+
+
+def detect(name: str, data: bytes) -> bool:
+    """YAML with a building's name and levels, and nothing that only a building.yaml has."""
+    if not name.lower().endswith((".yaml", ".yml")) or not _TOP.search(data):
+        return False
+    return bool(_LEVELS.search(data) and not _OF_BUILDING.search(data))
+
+
+def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
+    """The networks, and the doors and lifts that came from a building or from graphs."""
+    return [k for k in keys if k.layer == "topology" or (k.layer == "objects" and k.name in (NAME, BUILDING))]
+
+
+register(
+    Format(
+        name=NAME,
+        title="Navigation graphs (Open-RMF)",
+        files=("0.yaml",),
+        media_types=("application/yaml",),
+        carries=frozenset({"topology", "objects"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"objects"})),
+        family=NAME,
+        rank=30,
+        extensions=(".yaml", ".yml"),
+        choose=choose,
+        joined=True,
+    )
+)

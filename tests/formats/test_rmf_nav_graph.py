@@ -1,0 +1,265 @@
+"""rmf_nav_graph: graphs come back the same, and those made of a building equal what the official generator makes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import yaml
+
+from app import formats
+from app.bundle import Hints
+from app.convert import offline
+from app.errors import MissingLayer, UnreadableFile
+from app.formats import Group, ReadContext, WriteContext, get_format
+from app.model.features import Features, features
+from app.model.layers import Layers, PartKey
+
+FORMAT = get_format("rmf_nav_graph")
+SAMPLES = Path(__file__).resolve().parents[1] / "samples"
+Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
+
+
+def sample(kind: str, name: str) -> dict[str, bytes]:
+    folder = SAMPLES / kind / name
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def read(files: dict[str, bytes] | str) -> tuple[Layers, ReadContext]:
+    given = {"0.yaml": files.encode()} if isinstance(files, str) else files
+    told = ReadContext()
+    return formats.read(Group(FORMAT, next(iter(given)), given), told), told
+
+
+def write(layers: Layers) -> tuple[dict[str, Any], WriteContext]:
+    told = WriteContext()
+    files = formats.write(FORMAT, layers, told)
+    return {name: yaml.safe_load(data) for name, data in files.items()}, told
+
+
+def part(layers: Layers, layer: str, level: str) -> Features:
+    name = "network" if layer == "topology" else "rmf_nav_graph"
+    found = layers.parts[PartKey(layer, level, name)]  # type: ignore[arg-type]
+    assert isinstance(found, Features)
+    return found
+
+
+def generated(shared: Path) -> list[Path]:
+    found = sorted((shared / "data" / "rmf_nav_graph").glob("generated_*"))
+    assert len(found) >= 6
+    return found
+
+
+def test_every_real_graph_comes_back_the_same(shared: Path, same: Same) -> None:
+    for folder in [*generated(shared), shared / "data" / "openrmf_building" / "robast_sim"]:
+        files = {p.name: p.read_bytes() for p in folder.rglob("[0-9].yaml")}
+        back = offline(files, "rmf_nav_graph").files
+        assert sorted(back) == sorted(files)
+        assert same("rmf_nav_graph", files, back) == same("rmf_nav_graph", back, files) == [], folder
+        assert offline(back, "rmf_nav_graph").files == back
+
+
+def test_graphs_made_of_a_building_equal_those_of_the_official_generator(shared: Path, same: Same) -> None:
+    for folder in generated(shared):
+        building = shared / "data" / "openrmf_building" / folder.name.removeprefix("generated_")
+        source = next(building.glob("*.building.yaml"))
+        official = {p.name: p.read_bytes() for p in folder.rglob("*.yaml")}
+        made = offline({source.name: source.read_bytes()}, "rmf_nav_graph").files
+        assert sorted(made) == sorted(official)
+        assert same("rmf_nav_graph", official, made) == same("rmf_nav_graph", made, official) == [], folder
+
+
+def test_vertices_are_numbered_as_the_official_generator_does(shared: Path) -> None:
+    for folder in generated(shared):
+        building = shared / "data" / "openrmf_building" / folder.name.removeprefix("generated_")
+        source = next(building.glob("*.building.yaml"))
+        made = offline({source.name: source.read_bytes()}, "rmf_nav_graph").files
+        for path in folder.rglob("*.yaml"):
+            ours, theirs = yaml.safe_load(made[path.name]), yaml.safe_load(path.read_bytes())
+            for level, said in theirs["levels"].items():
+                assert ours["levels"][level]["lanes"] == said["lanes"]
+                names = [v[2] for v in said["vertices"]]
+                assert [v[2] for v in ours["levels"][level]["vertices"]] == names
+
+
+def test_facts_of_every_real_graph_hold_in_the_layers(shared: Path, facts_json: dict[str, Any]) -> None:
+    for folder in generated(shared):
+        for path in sorted(folder.rglob("*.yaml")):
+            facts = facts_json[path.relative_to(shared / "data").as_posix()]["facts"]
+            layers, _ = read({path.name: path.read_bytes()})
+            doors = 0
+            for level, said in facts["levels"].items():
+                network = part(layers, "topology", level)
+                kinds = Counter(p["kind"] for p in network.properties)
+                assert (kinds["node"], kinds["edge"]) == (said["vertices"], said["lanes_directed"])
+                if said["vertices"]:
+                    at = shapely.get_coordinates(network.of_kind("node").geometry)
+                    assert np.abs([at.min(0), at.max(0)] - np.array(said["bounds"])).max() < 6e-5
+            for objects in layers.vector("objects").values():
+                doors += len(objects.of_kind("door"))
+            assert doors == facts["doors"]
+
+
+def test_the_graphs_of_a_folder_are_one_network() -> None:
+    groups, rest = formats.group(sample("rmf_nav_graph", "clinic"))
+    assert [(g.format.name, sorted(g.files)) for g in groups] == [("rmf_nav_graph", ["0.yaml", "1.yaml"])]
+    assert rest == []
+    layers, _ = read(sample("rmf_nav_graph", "clinic"))
+    ground = part(layers, "topology", "Ground floor")
+    shared_node = ground.properties[ground.index()["ward: 3"]]
+    assert shared_node["rmf_nav_graph"]["graphs"] == {"0": 1, "1": 0}
+    assert len(ground.of_kind("node")) == 5
+    both = [p for p in ground.of_kind("edge").properties if p["rmf_nav_graph"]["index"] == 3]
+    assert {(p["source"], p["target"]) for p in both} == {
+        ("Ground floor/2", "lift_ground"),
+        ("lift_ground", "Ground floor/2"),
+    }
+    lift = part(layers, "objects", "Ground floor").of_kind("lift").properties[0]
+    assert (lift["size"][:2], lift["pose"][5]) == ([2.0, 2.5], 0.25)
+
+
+def test_our_sample_comes_back_row_by_row() -> None:
+    files = sample("rmf_nav_graph", "clinic")
+    said, told = write(read(files)[0])
+    for name, data in files.items():
+        assert said[name] == yaml.safe_load(data)
+    assert not told.dropped
+    assert not told.template
+
+
+def test_a_building_gives_doors_lifts_mutexes_limits_and_orientations() -> None:
+    made = offline(sample("openrmf", "clinic"), "rmf_nav_graph")
+    zero, one = (yaml.safe_load(made.files[name]) for name in ("0.yaml", "1.yaml"))
+    assert list(made.files) == ["0.yaml", "1.yaml"]
+    lane = {"door_name": "ward_door", "mutex": "hall", "speed_limit": 0.5}
+    assert zero["levels"]["Ground floor"]["lanes"] == [
+        [0, 1, {**lane, "orientation_constraint": "forward"}],
+        [1, 0, {**lane, "orientation_constraint": "backward"}],
+        [1, 2, {"is_bidirectional": False}],
+    ]
+    charger = zero["levels"]["Ground floor"]["vertices"][0]
+    assert charger[:2] == pytest.approx([2.94, -2.94])
+    assert charger[2] == {
+        "name": "charger_1",
+        "is_charger": True,
+        "is_parking_spot": True,
+        "spawn_robot_name": "nurse_1",
+    }
+    assert zero["levels"]["Upstairs"] == {"lanes": [], "vertices": []}
+    assert one["levels"]["Ground floor"]["vertices"][1][2] == {
+        "name": "lift_ground",
+        "lift": "Lift A",
+        "lift_cabin": "Lift A",
+    }
+    assert one["levels"]["Upstairs"]["vertices"][0][2]["lift"] == "Lift A"
+    assert one["levels"]["Upstairs"]["lanes"][0][2] == {"speed_limit": 1.25}
+    for graph in (zero, one):
+        assert graph["building_name"] == "clinic"
+        assert graph["doors"]["ward_door"]["map"] == "Ground floor"
+        assert graph["lifts"]["Lift A"]["position"] == pytest.approx([9.8, -4.41, 0.25])
+        assert graph["lifts"]["Lift A"]["dims"] == [2.0, 2.5]
+
+
+def test_metres_tell_offset_and_crs_and_docks_tell_lanes() -> None:
+    made = offline(sample("openrmf", "yard"), "rmf_nav_graph").files
+    graph = yaml.safe_load(made["3.yaml"])
+    assert (graph["offset"], graph["crs_name"]) == ([22700.5, 15900], "EPSG:3414")
+    text = (
+        "name: d\ncoordinate_system: cartesian_meters\nlevels:\n  L:\n    elevation: 0\n"
+        "    vertices: [[0, 0, 0, a], [5, 0, 0, b, {dock_name: [1, pump]}]]\n"
+        "    lanes: [[0, 1, {bidirectional: [4, true], graph_idx: [2, 0]}]]\n"
+    )
+    docked = yaml.safe_load(offline({"d.building.yaml": text.encode()}, "rmf_nav_graph").files["0.yaml"])
+    assert docked["levels"]["L"]["lanes"] == [[0, 1, {"dock_name": "pump"}], [1, 0, {"undock_name": "pump"}]]
+
+
+def test_graphs_become_a_building_and_are_the_same_again(same: Same, shared: Path) -> None:
+    for folder in generated(shared):
+        files = {p.name: p.read_bytes() for p in folder.rglob("*.yaml")}
+        building = offline(files, "openrmf").files
+        assert same("rmf_nav_graph", files, offline(building, "rmf_nav_graph").files) == []
+
+
+def test_a_network_of_another_format_is_graph_0_with_its_ids_as_names() -> None:
+    rows: list[tuple[str, Any, dict[str, Any]]] = [
+        ("a", shapely.Point(0, 0), {"kind": "node", "tmap2": {}}),
+        ("b", shapely.Point(2, 0), {"kind": "node", "name": "Bee"}),
+        ("c", shapely.Point(4, 0), {"kind": "node"}),
+        ("d", shapely.Point(4, 9), {"kind": "node"}),
+    ]
+    for a, b in ("ab", "ba", "bc"):
+        said = {"kind": "edge", "source": a, "target": b, "speed_limit": 0.5, "action": "move_base"}
+        rows.append((f"{a}_{b}", shapely.LineString([(0, 0), (1, 0)]), said))
+    said, told = write(Layers({PartKey("topology", "ground", "network"): features(rows, "local")}))
+    level = said["0.yaml"]["levels"]["ground"]
+    assert [v[2]["name"] for v in level["vertices"]] == ["a", "Bee", "c"]
+    assert level["lanes"] == [
+        [0, 1, {"speed_limit": 0.5}],
+        [1, 0, {"speed_limit": 0.5}],
+        [1, 2, {"speed_limit": 0.5, "is_bidirectional": False}],
+    ]
+    dropped = {line["what"]: line["count"] for line in told.dropped}
+    assert dropped == {"edges' actions": 3, "nodes without lanes": 1, "nodes' attributes of other formats": 1}
+    assert [line["what"] for line in told.template] == ["building_name"]
+
+
+def test_a_level_without_vertices_stays_a_level() -> None:
+    text = "building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}]], lanes: []}, M: {vertices: [], lanes: []}}\n"
+    said = yaml.safe_load(offline({"0.yaml": text.encode()}, "rmf_nav_graph").files["0.yaml"])
+    assert said["levels"]["M"] == {"lanes": [], "vertices": []}
+    assert offline({"0.yaml": text.encode()}, "tmap2").files, "an empty level is no part of other maps"
+
+
+def test_names_that_stand_twice_are_warned_of() -> None:
+    said, told = write(read("building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}], [1, 0, {name: a}]]}}\n")[0])
+    assert len(said["0.yaml"]["levels"]["L"]["vertices"]) == 2
+    assert "which fleet adapters refuse: a" in told.warnings[0].problem
+
+
+def test_without_a_lane_there_is_no_graph() -> None:
+    node = features([("a", shapely.Point(0, 0), {"kind": "node"})], "local")
+    with pytest.raises(MissingLayer, match="supply"):
+        write(Layers({PartKey("topology", "ground", "network"): node}))
+
+
+def test_lanes_to_vertices_that_do_not_exist_are_kept() -> None:
+    layers, told = read("building_name: x\nlevels: {L: {vertices: [[0, 0, {name: a}]], lanes: [[0, 4, {}]]}}\n")
+    assert "joins the vertices 0 and 4" in told.warnings[0].problem
+    said, warned = write(layers)
+    assert said["0.yaml"]["levels"]["L"]["lanes"] == [[0, 4, {}]]
+    assert "will refuse" in warned.warnings[0].problem
+
+
+HEAD = "building_name: x\nlevels:\n  L:\n"
+BROKEN = {
+    "building_name: x\nlevels: 3\n": "levels",
+    "building_name: x\nlevels: {}\n": "levels",
+    f"{HEAD}    vertices: [[1]]\n": "levels.L.vertices[0]",
+    f"{HEAD}    vertices: [[1, 2, 3]]\n": "levels.L.vertices[0][2]",
+    f"{HEAD}    vertices: [[1, null, {{}}]]\n": "levels.L.vertices[0][1]",
+    f"{HEAD}    lanes: [5]\n": "levels.L.lanes[0]",
+    f"{HEAD}    lanes: [[a, 1, {{}}]]\n": "levels.L.lanes[0][0]",
+    f"{HEAD}    vertices: []\ndoors: {{d: {{endpoints: [[0, 0]]}}}}\n": "doors.d.endpoints",
+    f"{HEAD}    vertices: []\nlifts: {{d: {{position: [0, 0, 0]}}}}\n": "lifts.d",
+}
+
+
+@pytest.mark.parametrize("text", BROKEN)
+def test_what_is_wrong_is_named(text: str) -> None:
+    with pytest.raises(UnreadableFile) as caught:
+        read(text)
+    assert caught.value.problems[0].where == BROKEN[text]
+    assert caught.value.problems[0].file == "0.yaml"
+
+
+def test_a_building_wins_over_its_graphs_on_the_same_level() -> None:
+    files = {**sample("openrmf", "clinic"), **sample("rmf_nav_graph", "clinic")}
+    said = yaml.safe_load(offline(files, "openrmf", hints=Hints()).files["building.yaml"])
+    alone = yaml.safe_load(offline(sample("openrmf", "clinic"), "openrmf").files["building.yaml"])
+    assert said == alone
+    assert offline(files, "rmf_nav_graph").files == offline(sample("openrmf", "clinic"), "rmf_nav_graph").files
