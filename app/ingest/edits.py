@@ -20,10 +20,10 @@ from app import formats
 from app.errors import Invalid, MissingDatum, NotFound, Problem
 from app.ingest.prepare import moved
 from app.model.features import NO_GEOMETRY, Features, Properties
-from app.model.frame import GROUND, MAX_METRES, Datum
+from app.model.frame import GROUND, MAX_METRES, Datum, Level
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
-from app.model.layers import NETWORK, SITE, VECTOR_LAYERS, ZONES, Layer, PartKey
+from app.model.layers import NETWORK, SITE, VECTOR_LAYERS, ZONES, Layer, PartKey, join_levels
 from app.store import Store
 from app.store.changes import KEEP, Changes, Delete, Provenance, Put, Replace
 from app.store.values import Version
@@ -104,6 +104,7 @@ class _Session:
         self._grids: dict[PartKey, OccupancyGrid] = {}
         self._keys = {e.key for e in base.parts}
         self._datum = base.datum
+        self._known = {level.name for level in base.levels}
 
     def apply(self, change: Mapping[str, Any]) -> None:
         """One edit of the contract: op put, delete or cells."""
@@ -184,7 +185,14 @@ class _Session:
                 operations.append(Put(key, Features(ids, geometry, properties, local), self._provenance(key)))
         for key, grid in sorted(self._grids.items()):
             operations.append(Replace(key, grid, self._provenance(key)))
-        return Changes(tuple(operations), KEEP if self._datum == self._base.datum else self._datum)
+        levels = join_levels(
+            self._base.levels, [Level(o.key.level) for o in operations if o.key.level not in self._known]
+        )
+        return Changes(
+            tuple(operations),
+            KEEP if self._datum == self._base.datum else self._datum,
+            KEEP if levels == self._base.levels else levels,
+        )
 
     def _provenance(self, key: PartKey) -> Provenance:
         """An edited part stays what it was made of: raw, derived …"""
@@ -213,6 +221,9 @@ class _Session:
         properties = feature.get("properties") or {}
         if not isinstance(properties, Mapping):
             raise Invalid("the feature's 'properties' must be an object")
+        # As the layer's answer says it, so that a feature can be put back where it was taken from.
+        shown = {"level": feature.get("level"), "name": feature.get("part")}
+        change = {**{k: v for k, v in shown.items() if isinstance(v, str) and v}, **change}
         if layer == "location":
             properties = self._take_datum(properties)
             if properties.get("kind") == "datum":

@@ -19,7 +19,7 @@ from app.errors import Invalid, Problem
 from app.formats import Limits
 from app.ingest.match import OWN_IDS, match_ids
 from app.model.features import Features, merge_documents
-from app.model.frame import Datum
+from app.model.frame import Datum, Level
 from app.model.grid import UNKNOWN, OccupancyGrid
 from app.model.layers import Part, PartKey, Resources, join_levels
 from app.store import Store
@@ -77,9 +77,12 @@ def prepare_upload(
         datum = told.datum
         warnings += moved(base, told.datum)
     levels: Any = KEEP
-    if told.levels:
-        known = join_levels(base.levels, told.levels)
-        levels = known if known != base.levels else KEEP
+    known = join_levels(base.levels, told.levels)
+    listed = {level.name for level in known}
+    # A level that only the upload's ``level`` names lies at 0 m until something tells its elevation.
+    known = join_levels(known, [Level(name) for name in sorted({key.level for key in told.parts} - listed)])
+    if known != base.levels:
+        levels = known
     prepared = store.prepare(base, Changes(tuple(operations), datum, levels))
     notes = [FileNote(name, use.format, use.used) for name, use in told.files.items()]
     notes += [FileNote(name, "zip", True) for name in uploaded.keys() - files.keys()]

@@ -144,3 +144,21 @@ def test_a_moved_line_does_not_move_the_network(api: Api, bare: str) -> None:
     after = features(api, bare, "topology")
     assert {i: f["geometry"] for i, f in after.items()} == {i: f["geometry"] for i, f in before.items()}
     assert {"other/0", "other/1"} <= set(before) & set(placemarks(api, bare))
+
+
+def test_a_level_of_its_own(api: Api, farm: str) -> None:
+    """The same names on two levels: a feature goes back to the level that it was shown on."""
+    body = api.upload(farm, {"n.tmap2.yaml": samples.tmap2()}, level="upstairs").json()
+    assert {"name": "upstairs", "elevation": 0.0} in body["changes"]["levels"]["to"]
+    shown = api.get(f"environments/{farm}/versions/4/layers/topology?crs=local").json()["features"]
+    (barn,) = [f for f in shown if f["id"] == "barn" and f["level"] == "upstairs"]
+    barn["place"]["coordinates"] = [11.0, 0.0]
+    edit(api, farm, put("topology", barn))
+    after = api.get(f"environments/{farm}/versions/5/layers/topology?crs=local").json()["features"]
+    places = {f["level"]: f["place"]["coordinates"] for f in after if f["id"] == "barn"}
+    assert places == {"ground": [10.0, 0.0], "upstairs": [11.0, 0.0]}
+    without = {k: v for k, v in barn.items() if k not in ("level", "part")}
+    edit(api, farm, put("topology", without), expect=422)
+    body = edit(api, farm, put("topology", {**without, "id": "attic"}, level="attic"))
+    assert "attic" in {level["name"] for level in body["changes"]["levels"]["to"]}
+    edit(api, farm, put("topology", {**without, "id": "odd", "level": 5, "part": None}))
