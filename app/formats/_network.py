@@ -38,9 +38,14 @@ def refuse(reason: str, where: str) -> NoReturn:
     raise UnreadableFile(f"{where}: {reason}", [Problem(reason, where=where)])
 
 
+def is_name(said: str) -> bool:
+    """Whether a text can stand in one line of any format."""
+    return 0 < len(said) <= MAX_NAME and is_writable(said)
+
+
 def checked_name(said: str, where: str) -> str:
-    """A name that can stand in one line of any format."""
-    if not 0 < len(said) <= MAX_NAME or not is_writable(said):
+    """The name, refused where it is none."""
+    if not is_name(said):
         refuse(f"a name must have 1 to {MAX_NAME} characters and no control characters, got {said[:60]!r}", where)
     return said
 
@@ -234,6 +239,11 @@ def own(properties: Properties, name: str) -> dict[str, Any]:
     """What a format knows of an item; empty where it knows nothing."""
     said = properties.get(name)
     return said if isinstance(said, dict) else {}
+
+
+def count(items: Any) -> int:
+    """How many items a list holds; what is no list holds none (other formats' files may say anything)."""
+    return len(items) if isinstance(items, list) else 0
 
 
 def only_2d(net: Net, context: WriteContext, why: str) -> None:

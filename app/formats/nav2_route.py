@@ -36,6 +36,7 @@ from app.formats._network import (
     Edge,
     Net,
     Node,
+    count,
     edge_lines,
     joined,
     known_document,
@@ -385,8 +386,9 @@ class _Writer:
             rows.append(self._feature(edge, n, self._shape(edge), ends))
         self._report()
         head = {"type": "FeatureCollection", **self._head()}
-        rows += [orjson.dumps(row) for row in self.document.get("ignored") or ()]
-        self.lost["dangling"] += len(self.document.get("dangling") or ())
+        ignored = self.document.get("ignored")
+        rows += [orjson.dumps(row) for row in ignored if isinstance(row, dict)] if isinstance(ignored, list) else []
+        self.lost["dangling"] += count(self.document.get("dangling"))
         context.drop("edges to nowhere", self.lost["dangling"], "Nav2 refuses a graph with one, and loses the old one")
         return orjson.dumps(head)[:-1] + b',"features":[\n' + b",\n".join(rows) + b"\n]}\n"
 
@@ -421,7 +423,7 @@ class _Writer:
         for reason in _doubts(properties):
             self.context.warn(reason, where=str(n))
         self.lost["attributes"] += bool(p.keys() - (CANONICAL_EDGE if ends else CANONICAL_NODE))
-        self.lost["dangling"] += len(mine.get("dangling") or ())
+        self.lost["dangling"] += count(mine.get("dangling"))
         members = mine.get("members")
         row = {"type": "Feature", "properties": properties, "geometry": geometry}
         if isinstance(members, dict):

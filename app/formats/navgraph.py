@@ -35,9 +35,11 @@ from app.formats._network import (
     Net,
     Node,
     checked_name,
+    count,
     edge_lines,
     identifier,
     is_flat,
+    is_name,
     joined,
     known_document,
     natural,
@@ -66,6 +68,8 @@ KNOWN_TAGS = MODES | {DIRECTED, "bidir"}
 
 _WORD = re.compile(r"[A-Za-z0-9_-]{1,64}\Z")
 
+NAMED = frozenset({"graph-name", "root"})
+TOP_KEYS = frozenset({"nodes", "connections", "default-properties"})
 NODE_KEYS = frozenset({"name", "pos", "properties"})
 CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME}) | AMONG_PARTS
 CANONICAL_EDGE = frozenset({"kind", "source", "target", NAME}) | AMONG_PARTS
@@ -266,9 +270,9 @@ def _connections(
 def _document(top: Mapping[str, Any], names: set[str], context: ReadContext) -> dict[str, Any]:
     """What the file says as a whole."""
     rest = {
-        key: _name(value, key) if value and key in ("graph-name", "root") else _plain(value, key)
+        key: str.__str__(value) if value and isinstance(value, str) and key in NAMED else _plain(value, key)
         for key, value in top.items()
-        if key not in ("nodes", "connections", "default-properties")
+        if key not in TOP_KEYS
     }
     if "graph-name" not in rest:
         context.warn("is missing; Fawkes asks for it", where="graph-name")
@@ -316,7 +320,7 @@ class _Writer:
 
     def _name_of(self, node: Node) -> str:
         said = own(node.properties, NAME).get("name")
-        return said if isinstance(said, str) and said else node.id
+        return said if isinstance(said, str) and is_name(said) else node.id
 
     def file(self) -> str:
         """The whole text."""
@@ -341,7 +345,7 @@ class _Writer:
     def _head(self) -> str:
         """The keys before the nodes."""
         said = self.document.get("top")
-        top = dict(said) if isinstance(said, dict) else {}
+        top = {w: v for w, v in said.items() if w not in TOP_KEYS} if isinstance(said, dict) else {}
         if not isinstance(top.get("graph-name"), str) or not top["graph-name"]:
             top["graph-name"] = self.context.title
             self.context.fill("graph-name", self.context.title, "no source names it")
@@ -385,9 +389,9 @@ class _Writer:
         if properties:
             text += "    properties:\n" + _listed(properties, rest.get("words"), 6)
         more = rest.get("more")
-        if isinstance(more, dict) and more:
+        if isinstance(more, dict) and (more := {w: v for w, v in more.items() if w not in NODE_KEYS}):
             text += _yaml.mapping(more, 4)
-        self.lost["dangling"] += len(rest.get("dangling") or ())
+        self.lost["dangling"] += count(rest.get("dangling"))
         return text[:-1]
 
     def _connections(self) -> Iterator[_Connection]:
@@ -514,7 +518,7 @@ class _Writer:
         context.drop("attributes of nodes that are no scalars", lost["node attributes"], "Fawkes' properties are texts")
         context.drop("tilts of nodes", lost["tilted"], "an orientation is one angle")
         context.drop("intersection tags", lost["one-way modes"], "the connection is one-way now and has one tag only")
-        lost["dangling"] += len(self.document.get("dangling") or ())
+        lost["dangling"] += count(self.document.get("dangling"))
         context.drop("connections to nowhere", lost["dangling"], "Fawkes refuses a graph with one")
 
 

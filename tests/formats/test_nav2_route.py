@@ -495,3 +495,20 @@ def test_detection() -> None:
     assert FORMAT.detect("b.geojson", b"\xef\xbb\xbf\n" + data)
     assert not FORMAT.detect("b.geojson", b"x" + data)
     assert not FORMAT.detect("b.geojson", b'{"type":"FeatureCollection","features":[]}')
+
+
+def test_odd_values_of_our_words_are_served_as_far_as_they_go() -> None:
+    odd: list[Any] = [5, "x", [1], {"a": 1}, None, [[1]], True, {"id": -1}]
+    for value in odd:
+        own = dict.fromkeys(("id", "properties", "members", "geometry", "dangling", "line"), value)
+        inner = {"properties": dict.fromkeys(("id", "startid", "metadata", "operations", "cost", "frame"), value)}
+        rows: list[tuple[str, Any, dict[str, Any]]] = [
+            ("a", shapely.Point(0, 0), {"kind": "node", "name": value, "nav2_route": own}),
+            ("b", shapely.Point(1, 0), {"kind": "node", "width": value, "nav2_route": inner}),
+            ("e", shapely.Point(1, 0), {"kind": "edge", "source": "a", "target": "b", "nav2_route": own}),
+            ("f", shapely.Point(1, 0), {"kind": "edge", "source": "b", "target": "a", "nav2_route": inner}),
+            ("g", shapely.Point(1, 0), {"kind": "edge", "source": value, "target": value, "nav2_route": value}),
+        ]
+        for document in ({"members": value, "ignored": value, "dangling": value}, value):
+            served, _ = write(features(rows, "local", {"nav2_route": document}))
+            assert len(json.loads(served)["features"]) >= 4

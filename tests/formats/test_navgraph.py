@@ -510,3 +510,19 @@ def test_yaml_tags_are_for_formats_that_name_them() -> None:
 def test_hints_name_the_format() -> None:
     files = {"plain.yaml": b"nodes:\n- name: A\n  pos: [1, 2]\n"}
     assert b"pos: [1.0, 2.0]" in offline(files, "navgraph", hints=Hints("navgraph")).files["navgraph.yaml"]
+
+
+def test_odd_values_of_our_words_are_served_as_far_as_they_go() -> None:
+    odd: list[Any] = [5, "x", [1], {"a": 1}, None, [[1]], True]
+    for value in odd:
+        own = dict.fromkeys(("name", "tag", "properties", "words", "more", "dangling", "order", "backward"), value)
+        rows: list[tuple[str, Any, dict[str, Any]]] = [
+            ("a", shapely.Point(0, 0), {"kind": "node", "orientation": value, "name": value, "navgraph": own}),
+            ("b", shapely.Point(1, 0), {"kind": "node", "navgraph": {"more": {"name": "c", "pos": 1}}}),
+            ("e", shapely.Point(1, 0), {"kind": "edge", "source": "a", "target": "b", "navgraph": own}),
+            ("f", shapely.Point(1, 0), {"kind": "edge", "source": value, "target": value, "navgraph": value}),
+        ]
+        top = dict.fromkeys(("top", "defaults", "words", "dangling"), value)
+        for document in ({"navgraph": top}, {"navgraph": value}, {"navgraph": {"top": {"nodes": 1, "root": value}}}):
+            served, _ = write(features(rows, "local", document))
+            assert len(read(served)[0]) == 3
