@@ -105,7 +105,8 @@ def check(folder: Path, address: str, ledger: Ledger) -> int:
                 assert client.get(f"{place}/sources/{name}").content == data
             assert client.get(f"{place}/layers/occupancy", params={"name": "room"}).status_code == 200
         if head:
-            assert client.get(f"{ENVIRONMENT}/versions/latest/maps/occupancy_grid").status_code == 200
+            answer = client.get(f"{ENVIRONMENT}/versions/latest/maps/occupancy_grid")
+            assert answer.status_code == 200, answer.text
     with contextlib.closing(sqlite3.connect(folder / "data" / "fleetmap.sqlite3")) as database:
         assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
     left = [p for p in (folder / "data" / "blobs" / "tmp").iterdir() if p.name != ".lock"]
