@@ -138,9 +138,7 @@ def test_a_whole_template_folder_is_one_version(api: Api, shared: Path, same: Sa
     assert {s["name"] for s in made["sources"]} == set(files)
     used = {s["name"] for s in made["sources"] if s["used"]}
     for grid in {n.split("/")[2] for n in used if n.startswith("config/metric/") and n.endswith(".yaml")}:
-        answer = {
-            n: api.get(f"/maps/{env}/occupancy_grid/{n}").content for n in (f"{grid}.yaml", f"{grid}.pgm")
-        }
+        answer = {n: api.get(f"/maps/{env}/occupancy_grid/{n}").content for n in (f"{grid}.yaml", f"{grid}.pgm")}
         original = {n.rpartition("/")[2]: d for n, d in files.items() if f"/metric/{grid}/" in n and n in used}
         assert same("occupancy_grid", original, answer) == []
     if any(n.endswith("network.tmap2.yaml") for n in files):

@@ -18,6 +18,7 @@ from app.store.values import Role, Token
 
 SECRET_BYTES: Final = 32
 
+
 class Tokens(Base):
     """Who may do what."""
 
