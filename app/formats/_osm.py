@@ -150,11 +150,11 @@ def _character(match: re.Match[str]) -> str:
 # --- the quick way through XML -----------------------------------------------------------------------------------
 
 _ROOT = re.compile(
-    rb'(?:\xef\xbb\xbf)?\s*+(?:<\?xml(?:[^>"\']|"[^"<>]*"|\'[^\'<>]*\')*\?>\s*+)?<osm((?:\s+[\w:.-]+="[^"<]*")*+)\s*+>'
+    rb'(?:\xef\xbb\xbf)?\s*+(?:<\?xml(?:[^>"\']|"[^"<>]*"|\'[^\'<>]*\')*\?>\s*+)?<osm((?>(?:\s+[\w:.-]+="[^"<]*")*))\s*+>'
 )
 _ENCODING = re.compile(rb"<\?xml[^>]*encoding\s*=\s*[\"']([\w.-]+)[\"']")
 _ATTRIBUTE = re.compile(rb'([\w:.-]+)="([^"<\t\r\n]*)"')
-_MORE = rb'((?: (?!id="|lat="|lon=")[A-Za-z_][\w:.-]*+="[^"<\t\r\n]*+")*+)'
+_MORE = rb'((?>(?: (?!id="|lat="|lon=")[A-Za-z_][\w:.-]*+="[^"<\t\r\n]*+")*))'
 _DEGREES = rb'"(-?\d+(?:\.\d+)?)"'
 _NODE = re.compile(
     rb'<node id="(-?\d{1,19})"' + _MORE + b" lat=" + _DEGREES + b" lon=" + _DEGREES + _MORE + rb" ?(/?)>"
@@ -163,7 +163,7 @@ _HEAD = re.compile(rb'id="(-?\d{1,19})"' + _MORE + rb" ?(/?)>")
 _ND = re.compile(rb'<nd ref="(-?\d{1,19})" ?/>')
 _TAG = re.compile(rb'<tag k="([^"<\t\r\n]*)" v="([^"<\t\r\n]*)" ?/>')
 _MEMBER = re.compile(rb'<member type="(node|way|relation)" ref="(-?\d{1,19})" role="([^"<\t\r\n]*)" ?/>')
-_BOUNDS = re.compile(rb'<bounds((?: [\w:.-]+="[^"<\t\r\n]*")*+) ?/>')
+_BOUNDS = re.compile(rb'<bounds((?>(?: [\w:.-]+="[^"<\t\r\n]*")*)) ?/>')
 
 
 def _pair(two: bytes) -> int:

@@ -23,7 +23,7 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}(?![A-Za-z0-9_])")
 _EXPORT = re.compile(r"export(?=[ \t])")
 _BLANK = re.compile(r"[ \t]*")
 _SINGLE = re.compile(r"'([^'\n]*)'")
-_DOUBLE = re.compile(r'"((?:[^"\\$`\n]|\\[^\n])*+)"')
+_DOUBLE = re.compile(r'"((?>(?:[^"\\$`\n]|\\[^\n])*))"')
 _BARE = re.compile(r"[^\s'\"\\$`;&|<>(){}*?\[\]~#!\x00-\x1f]+")
 _ESCAPE = re.compile(r"\\([^\n])")
 _ESCAPED = re.compile(r'\\(["\\$`])')
@@ -34,7 +34,7 @@ _NEXT = re.compile(r"[ \t]+(?=[A-Za-z_])")
 _PIECE = re.compile(
     r"""
       '[^']*+(?:'|\Z)                            # quoted text may hold line ends
-    | "(?:[^"\\]|\\.)*+(?:"|\Z)
+    | "(?>(?:[^"\\]|\\.)*)(?:"|\Z)
     | \\(?:.|\Z)                                 # an escaped character; an escaped line end continues the line
     | (?<![^\s;&|(){}])\#[^\n]*                  # a comment begins a word
     | <<-?[ \t]*['"]?(?P<here>[A-Za-z0-9_]+)['"]?

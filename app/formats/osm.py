@@ -190,7 +190,7 @@ def detect(name: str, data: bytes) -> bool:  # noqa: ARG001
     return bool(_FIRST.match(head.lstrip(b"\xef\xbb\xbf")))
 
 
-_FIRST = re.compile(rb"(?s)\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+(?:<osm[\s/>]|<!DOCTYPE\s+osm\b)")
+_FIRST = re.compile(rb"(?s)\s*+(?>(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*)(?:<osm[\s/>]|<!DOCTYPE\s+osm\b)")
 _GZIP = tuple(b"\x1f\x8b" + bytes([k]) for k in (8,))
 
 
