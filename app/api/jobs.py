@@ -127,8 +127,10 @@ class Work:
 
     def _finished(self, recipe: Recipe, done: asyncio.Future[Made]) -> None:
         self._running.pop(recipe.key, None)
-        failed = done.cancelled() or done.exception() is not None
-        self._count(recipe.format.name, "failed" if failed else "made")
+        if done.cancelled() or done.exception() is not None:
+            self._count(recipe.format.name, "failed")
+        elif done.result().fresh:  # else another request or process had just made it
+            self._count(recipe.format.name, "made")
 
 
 def _problem(error: BaseException) -> dict[str, Any]:

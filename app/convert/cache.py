@@ -14,7 +14,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -38,11 +38,12 @@ class MadeFile:
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """A made map: its files (main file first), the one thing to download, and the report."""
+    """A made map: its files (main file first), the one thing to download, the report; fresh: made just now."""
 
     files: tuple[MadeFile, ...]
     archive: MadeFile | None
     report: dict[str, Any]
+    fresh: bool = field(default=False, compare=False)
 
     def whole(self) -> MadeFile:
         """The file itself where the map is one file, else the zip of all."""
@@ -106,7 +107,7 @@ class Cache:
                 self.hits += 1
                 return found
             self.misses += 1
-            return self._store(key, maker())
+            return replace(self._store(key, maker()), fresh=True)
 
     def _store(self, key: str, product: Product) -> Made:
         making = self._folder / f"making-{uuid4().hex}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -43,3 +44,19 @@ def _check_depth(data: bytes) -> None:
     if len(steps) and int(np.cumsum(steps, dtype=np.int64).max()) > MAX_DEPTH:
         reason = f"nested deeper than {MAX_DEPTH}"
         raise UnreadableFile(reason, [Problem(reason)])
+
+
+def ranks(words: str) -> dict[str, int]:
+    """The words of a text with their places, for ``ordered``."""
+    return {word: rank for rank, word in enumerate(words.split())}
+
+
+def ordered(value: Any, words: Mapping[str, int]) -> Any:
+    """The value with the keys of all its objects in order: these words by their rank, then others by alphabet.
+
+    So that equal values give equal bytes, however they were put together.
+    """
+    if isinstance(value, dict):
+        last = len(words)
+        return {k: ordered(value[k], words) for k in sorted(value, key=lambda k: (words.get(k, last), k))}
+    return [ordered(v, words) for v in value] if isinstance(value, list) else value

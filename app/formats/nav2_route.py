@@ -341,6 +341,15 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     return {"graph.geojson": _Writer(layers, context).data()}
 
 
+ORDER = _json.ranks(
+    "type name id startid endid frame trigger cost overridable metadata operations properties geometry coordinates"
+)
+
+
+def _dump(value: Any) -> bytes:
+    return orjson.dumps(_json.ordered(value, ORDER))
+
+
 class _Writer:
     def __init__(self, layers: Layers, context: WriteContext) -> None:
         self.context = context
@@ -387,10 +396,10 @@ class _Writer:
         self._report()
         head = {"type": "FeatureCollection", **self._head()}
         ignored = self.document.get("ignored")
-        rows += [orjson.dumps(row) for row in ignored if isinstance(row, dict)] if isinstance(ignored, list) else []
+        rows += [_dump(row) for row in ignored if isinstance(row, dict)] if isinstance(ignored, list) else []
         self.lost["dangling"] += count(self.document.get("dangling"))
         context.drop("edges to nowhere", self.lost["dangling"], "Nav2 refuses a graph with one, and loses the old one")
-        return orjson.dumps(head)[:-1] + b',"features":[\n' + b",\n".join(rows) + b"\n]}\n"
+        return _dump(head)[:-1] + b',"features":[\n' + b",\n".join(rows) + b"\n]}\n"
 
     def _head(self) -> dict[str, Any]:
         members = self.document.get("members")
@@ -428,7 +437,7 @@ class _Writer:
         row = {"type": "Feature", "properties": properties, "geometry": geometry}
         if isinstance(members, dict):
             row |= {w: v for w, v in members.items() if w not in row}
-        return orjson.dumps(row)
+        return _dump(row)
 
     def _metadata(self, p: Properties, number: str) -> dict[str, Any]:
         """The canonical words among the metadata."""

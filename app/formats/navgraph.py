@@ -143,6 +143,7 @@ class _Read:
         display = properties.get("name")
         if isinstance(display, str) and display not in ("", self.name) and "name" not in self.words:
             out["name"] = display
+            rest["name"] = self.name  # also where the item is found again under another id
             del properties["name"]
         turned = properties.get("orientation")
         if isinstance(turned, (int, float)) and not isinstance(turned, bool):

@@ -52,6 +52,8 @@ class _Draft:
     puts: dict[str, tuple[Any, Properties, bool]] = field(default_factory=dict)
     deletes: set[str] = field(default_factory=set)
     place: Mapping[str, int] = field(init=False)
+    dragged: set[str] = field(default_factory=set)
+    _edges: dict[str, list[str]] | None = None
 
     def __post_init__(self) -> None:
         self.place = {} if self.stored is None else {item: k for k, item in enumerate(self.stored.ids)}
@@ -69,6 +71,16 @@ class _Draft:
         assert self.stored is not None
         k = self.place[item]
         return self.stored.geometry[k], self.stored.properties[k], bool(self.stored.local[k])
+
+    def edges_at(self, node: str) -> list[str]:
+        """The stored edges that start or end at a node."""
+        if self._edges is None:
+            self._edges = defaultdict(list)
+            for item, p in zip(self.place, self.stored.properties if self.stored is not None else (), strict=True):
+                if p.get("kind") == "edge":
+                    for end in {str(p.get("source")), str(p.get("target"))}:
+                        self._edges[end].append(item)
+        return self._edges.get(node, [])
 
     def edited(self) -> set[str]:
         """The stored items that go, or become something else."""
@@ -245,6 +257,7 @@ class _Session:
         if before is None or geometry is not before[0]:
             _check_shape(what, item, geometry)
         draft.deletes.discard(item)
+        draft.dragged.discard(item)
         draft.puts[item] = (geometry, dict(properties), local)
         if layer == "topology" and properties["kind"] == "node" and before is not None:
             self._drag_edges(draft, item, before, (geometry, local))
@@ -296,17 +309,14 @@ class _Session:
         """Edges that ended at a node's old place end at its new one, unless this change puts them itself."""
         if draft.stored is None or before[0].equals_exact(now[0], 0.0):
             return
-        for k, properties in enumerate(draft.stored.properties):
-            item = draft.stored.ids[k]
-            if properties.get("kind") != "edge" or item in draft.puts or item in draft.deletes:
+        for item in draft.edges_at(node):
+            if item in draft.deletes or (item in draft.puts and item not in draft.dragged):
                 continue
-            if node not in (properties.get("source"), properties.get("target")):
-                continue
-            local = bool(draft.stored.local[k])
+            line, properties, local = draft.row(item)  # its other end may have been dragged before
             place = now[0] if now[1] == local else self._other(now[0], now[1])
-            line = draft.stored.geometry[k]
             if line.geom_type != "LineString":
                 continue
+            draft.dragged.add(item)
             vertices = shapely.get_coordinates(line, include_z=line.has_z)
             target = shapely.get_coordinates(place, include_z=bool(line.has_z))[0]
             target = np.nan_to_num(target, nan=0.0)
@@ -325,7 +335,7 @@ class _Session:
         if not draft.holds(item):
             raise NotFound(f"there is no feature {item!r} in {layer}")
         draft.puts.pop(item, None)
-        if draft.stored is not None and item in set(draft.stored.ids):
+        if item in draft.place:
             draft.deletes.add(item)
 
     def _key_of(self, layer: Layer, item: str, change: Mapping[str, Any]) -> PartKey:

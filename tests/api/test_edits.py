@@ -162,3 +162,15 @@ def test_a_level_of_its_own(api: Api, farm: str) -> None:
     body = edit(api, farm, put("topology", {**without, "id": "attic"}, level="attic"))
     assert "attic" in {level["name"] for level in body["changes"]["levels"]["to"]}
     edit(api, farm, put("topology", {**without, "id": "odd", "level": 5, "part": None}))
+
+
+def test_an_edge_follows_both_of_its_nodes_moved_in_one_edit(api: Api, farm: str) -> None:
+    shown = features(api, farm, "topology", crs="local")
+    edge = next(f for f in shown.values() if f["properties"]["kind"] == "edge")
+    ends = [shown[edge["properties"][end]] for end in ("source", "target")]
+    for node in ends:
+        node["place"]["coordinates"] = [v + 3.0 for v in node["place"]["coordinates"]]
+        node.pop("geometry", None)
+    edit(api, farm, *(put("topology", node, crs="local") for node in ends))
+    moved = features(api, farm, "topology", crs="local")[edge["id"]]
+    assert moved["place"]["coordinates"] == [node["place"]["coordinates"] for node in ends]

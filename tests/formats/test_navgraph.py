@@ -195,6 +195,7 @@ def test_facts_of_the_sample() -> None:
     assert dock["name"] == "Charging dock"
     assert dock["orientation"] == pytest.approx([0, 0, math.sin(4.71 / 2), math.cos(4.71 / 2)])
     assert dock["navgraph"] == {
+        "name": "Dock",
         "properties": {"orientation": 4.71, "highway_exit": True},
         "words": ["highway_exit"],
     }
