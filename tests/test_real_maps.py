@@ -25,6 +25,9 @@ KINDS = {
     "occupancy_map_yaml": "occupancy_grid",
     "openrmf_building": "openrmf",
     "rmf_nav_graph": "rmf_nav_graph",
+    "fawkes_navgraph": "navgraph",
+    "nav2_route_graph": "nav2_route",
+    "lif": "lif",
 }
 
 REFUSED = {

@@ -1,0 +1,729 @@
+"""lif: VDMA's Layout Interchange Format 1.0, the tracks of automated guided vehicles as JSON.
+
+A file has layouts, each with nodes, directed edges and stations; all of them share one origin, metres, x and y. What a
+type of vehicle may do at a node or along an edge stands in a list with one entry for each type. Two drafts of 2.0 are
+read too and served as they came: one calls vehicles mobile robots, the other one also puts layouts into ``origins``.
+Source: VDMA LIF 1.0.0 (LIF.md, section 8).
+
+Canonical: a layout's ``layoutLevelId`` is its level (without one, the level asked for), its nodes and edges are that
+level's network, its stations objects of the kind ``station``. An item's id is the file's; ``nodeName``, ``edgeName``
+and ``stationName`` are its name. A speed or an orientation that all types of vehicle share is the item's: an edge's
+``maxSpeed`` is its ``speed_limit``, a node's ``theta`` its ``orientation``, and a trajectory of degree 1 is an edge's
+bends. ``properties.lif`` holds the rest of the item under ``item``, its ``id``, the ``layout`` it stands in and ``at``
+which place there, and a node's ``dangling`` edges. The document's ``lif`` holds the file's other members under ``top``
+and what it says of its ``layouts`` and ``origins``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import orjson
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _json, register
+from app.formats._network import (
+    AMONG_PARTS,
+    SAME_ANGLE,
+    Array,
+    Edge,
+    Node,
+    checked_name,
+    count,
+    edge_lines,
+    identifier,
+    is_flat,
+    is_name,
+    joined,
+    natural,
+    node_points,
+    number,
+    own,
+    quaternion,
+    refuse,
+    said_yaw,
+    some,
+    without_repeats,
+)
+from app.formats._text import METRES
+from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, unique_ids
+from app.model.frame import GROUND
+from app.model.layers import NETWORK, Layers, Part, PartKey
+from app.parameters import parameter
+
+NAME = "lif"
+VERSION = "1.0.0"
+EPOCH = "1970-01-01T00:00:00.00Z"
+"""Where a source tells no time: the same network must give the same bytes."""
+
+ORDER = _json.ranks(
+    "metaInformation projectIdentification lifId creator exportTimestamp lifVersion origins originId layoutId "
+    "layoutName layoutVersion layoutLevelId layoutDescription layouts nodes edges stations nodeId nodeName "
+    "nodeDescription mapId nodePosition edgeId edgeName edgeDescription startNodeId endNodeId stationId "
+    "interactionNodeIds stationName stationDescription stationHeight stationPosition x y theta weight "
+    "vehicleTypeNodeProperties vehicleTypeEdgeProperties vehicleTypeId actionType actionDescription "
+    "requirementType blockingType actionParameters key value degree knotVector controlPoints"
+)
+"""How the keys follow each other, as in the specification."""
+
+LISTS = frozenset({"nodes", "edges", "stations"})
+CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME}) | AMONG_PARTS
+CANONICAL_EDGE = frozenset({"kind", "name", "source", "target", "speed_limit", NAME}) | AMONG_PARTS
+CANONICAL_STATION = frozenset({"kind", "name", NAME}) | AMONG_PARTS
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """How a version of the format calls what types of vehicle have of their own, and the member that names a type."""
+
+    node: str
+    edge: str
+    type: str
+
+    def type_of(self, name: str) -> dict[str, Any]:
+        """The member that names a type of vehicle."""
+        if self.type == "mobileRobotTypes":
+            return {self.type: [{"manufacturer": name, "seriesName": name}]}
+        return {self.type: name}
+
+
+FIRST = Dialect("vehicleTypeNodeProperties", "vehicleTypeEdgeProperties", "vehicleTypeId")
+SECOND = Dialect("mobileRobotTypeNodeProperties", "mobileRobotTypeEdgeProperties", "mobileRobotTypeId")
+THIRD = Dialect(SECOND.node, SECOND.edge, "mobileRobotTypes")
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What the file says where no source does."""
+
+    vehicle_type: str = parameter("any", "type of vehicle of nodes and edges whose source names none")
+    creator: str = parameter("Fleet Map Server", "creator of a file that no source names one for")
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """Networks by level, and stations as objects, in local metres. Raises UnreadableFile naming the item."""
+    if not (context.wants("topology") or context.wants("objects")):
+        return Layers()
+    top = _json.load(files[context.main or next(iter(files))], context.limits)
+    if not isinstance(top, dict) or not isinstance(top.get("layouts", top.get("origins")), list):
+        reason = "a LIF file is one object with an array of layouts"
+        raise UnreadableFile(reason, [Problem(reason, where="layouts")])
+    return _Reader(top, context).layers()
+
+
+@dataclass(slots=True)
+class _Item:
+    """A node, edge or station of the file."""
+
+    said: dict[str, Any]
+    where: str
+    name: str
+    layout: str
+    at: int
+    level: str
+    id: str = ""
+
+
+@dataclass(slots=True)
+class _Level:
+    """What becomes of one level: places of its nodes, its edges and stations with what they need of the nodes."""
+
+    nodes: list[int] = field(default_factory=list)
+    edges: list[tuple[_Item, int, int]] = field(default_factory=list)
+    stations: list[_Item] = field(default_factory=list)
+
+
+class _Reader:
+    def __init__(self, top: dict[str, Any], context: ReadContext) -> None:
+        self.top, self.context = top, context
+        self.doubts: Counter[str] = Counter()
+        self.heads: list[dict[str, Any]] = []
+        self.found: dict[str, list[_Item]] = {kind: [] for kind in ("node", "edge", "station")}
+        self.document: dict[str, Any] = {
+            "top": {w: v for w, v in top.items() if w not in ("layouts", "origins")},
+            "layouts": self.heads,
+        }
+        self.version()
+        for row, where in self.layouts():
+            self.layout(row, where)
+        total = sum(map(len, self.found.values()))
+        if total > context.limits.features:
+            raise TooLarge(f"the file has {total} items; the limit is {context.limits.features}")
+
+    def version(self) -> None:
+        meta = self.top.get("metaInformation")
+        said = meta.get("lifVersion") if isinstance(meta, dict) else None
+        if not isinstance(said, str):
+            self.context.warn("is missing; it is read as version 1.0", where="metaInformation.lifVersion")
+        elif said.split(".")[0] not in ("0", "1"):
+            self.context.warn(
+                f"version {said[:40]} is a draft, read as far as it is known; it is served as it came",
+                where="metaInformation.lifVersion",
+            )
+
+    def layouts(self) -> Iterable[tuple[Any, str]]:
+        """(layout, where it stands), also those inside of origins."""
+        for k, row in enumerate(self._list(self.top, "layouts", "")):
+            yield row, f"layouts[{k}]"
+        origins = self._list(self.top, "origins", "")
+        if "origins" in self.top:
+            self.document["origins"] = heads = []
+        if len(origins) > 1:
+            self.context.warn("origins need not fit together: all are taken for the local one", where="origins")
+        for k, origin in enumerate(origins):
+            where = f"origins[{k}]"
+            if not isinstance(origin, dict):
+                refuse("must be an object", where)
+            first = len(self.heads)
+            for j, row in enumerate(self._list(origin, "layouts", where)):
+                yield row, f"{where}.layouts[{j}]"
+            said = [head["layoutId"] for head in self.heads[first:]]
+            heads.append({"head": {w: v for w, v in origin.items() if w != "layouts"}, "layouts": said})
+
+    def _list(self, of: Mapping[str, Any], word: str, where: str) -> list[Any]:
+        said = of.get(word)
+        if not isinstance(said, (list, type(None))):
+            refuse("must be an array", f"{where}.{word}".lstrip("."))
+        return said or []
+
+    def layout(self, row: Any, where: str) -> None:
+        """Take in a layout's items."""
+        if not isinstance(row, dict):
+            refuse("must be an object", where)
+        said = row.get("layoutId")
+        if not isinstance(said, str) or not is_name(said):
+            refuse("a layout needs an id, a text", f"{where}.layoutId")
+        if any(head["layoutId"] == said for head in self.heads):
+            refuse(f"the layout {said!r} stands twice: give layouts different ids", f"{where}.layoutId")
+        self.heads.append({w: v for w, v in row.items() if w not in LISTS})
+        level = row.get("layoutLevelId")
+        if level is None or level == "":
+            level = self.context.level
+        elif not isinstance(level, str):
+            refuse("must be a text", f"{where}.layoutLevelId")
+        level = checked_name(level, f"{where}.layoutLevelId")
+        for kind, items in self.found.items():
+            for at, item in enumerate(self._list(row, f"{kind}s", where)):
+                spot = f"{where}.{kind}s[{at}]"
+                if not isinstance(item, dict):
+                    refuse("must be an object", spot)
+                name = item.get(f"{kind}Id")
+                if isinstance(name, (int, float)) and not isinstance(name, bool):
+                    self.context.warn(f"{name!r} is no text; it is served as one", where=f"{spot}.{kind}Id")
+                    name = str(name)
+                if not isinstance(name, str):
+                    refuse("needs an id, a text", f"{spot}.{kind}Id")
+                items.append(_Item(item, spot, checked_name(name, f"{spot}.{kind}Id"), said, at, level))
+
+    def layers(self) -> Layers:
+        nodes, edges, stations = self.found["node"], self.found["edge"], self.found["station"]
+        taken: set[str] = set()
+        for kind, items in (("nodes", nodes), ("edges", edges)):
+            for item, i in zip(items, unique_ids((identifier(item.name) for item in items), taken), strict=True):
+                item.id = i
+                taken.add(i)
+            if again := without_repeats([item.name for item in items]):
+                self.context.warn(f"{len(again)} {kind} share an id: {some(again)}; references mean the first one")
+        for item, i in zip(stations, unique_ids(identifier(s.name) for s in stations), strict=True):
+            item.id = i
+        place = {item.name: k for k, item in reversed(list(enumerate(nodes)))}
+        xyz: Array = np.array([self.position(n.said.get("nodePosition"), n.where, "node") for n in nodes], np.float64)
+        xyz = xyz.reshape(-1, 3)
+        levels: dict[str, _Level] = {}
+        for k, node in enumerate(nodes):
+            levels.setdefault(node.level, _Level()).nodes.append(k)
+        properties = [self.node(node) for node in nodes]
+        for edge in edges:
+            self.join(edge, place, properties, levels)
+        for station in stations:
+            self.check_station(station, place)
+            levels.setdefault(station.level, _Level()).stations.append(station)
+        parts: dict[PartKey, Part] = {}
+        for level, content in levels.items():
+            if content.nodes or content.edges:
+                parts[PartKey("topology", level, NETWORK)] = self.network(content, xyz, nodes, properties)
+            if content.stations:
+                parts[PartKey("objects", level, NAME)] = self.stations(content.stations)
+        if not parts:
+            empty = Features((), np.empty(0, object), (), np.empty(0, bool), {NAME: self.document})
+            parts[PartKey("topology", self.context.level, NETWORK)] = empty
+        for what, n in sorted(self.doubts.items()):
+            self.context.warn(f"{n} {what}")
+        return Layers(parts)  # LIF does not say how high its levels are
+
+    def position(self, said: Any, where: str, kind: str) -> tuple[float, float, float]:
+        """x, y in metres, and 0."""
+        where = f"{where}.{kind}Position"
+        if not isinstance(said, dict) or "x" not in said or "y" not in said:
+            refuse("must be an object with x and y", where)
+        return number(said["x"], f"{where}.x"), number(said["y"], f"{where}.y"), 0.0
+
+    def mine(self, item: _Item, kind: str, *known: str) -> dict[str, Any]:
+        """What only this format knows of an item; ``known`` members are canonical."""
+        position = item.said.get(f"{kind}Position")
+        rest = {w: v for w, v in item.said.items() if w not in (f"{kind}Id", *known)}
+        if isinstance(position, dict):
+            rest.pop(f"{kind}Position", None)
+            if more := {w: v for w, v in position.items() if w not in ("x", "y")}:
+                rest[f"{kind}Position"] = more
+        out: dict[str, Any] = {"id": item.name, "layout": item.layout, "at": item.at}
+        name = rest.get(f"{kind}Name")
+        if isinstance(name, str) and is_name(name) and name != item.name:
+            del rest[f"{kind}Name"]
+        out["item"] = rest
+        return out
+
+    def named(self, item: _Item, kind: str) -> dict[str, Any]:
+        name = item.said.get(f"{kind}Name")
+        return {"name": name} if isinstance(name, str) and is_name(name) else {}
+
+    def node(self, item: _Item) -> dict[str, Any]:
+        mine = self.mine(item, "node")
+        out: dict[str, Any] = {"kind": "node", "name": item.name, **self.named(item, "node")}
+        entries = _entries(mine["item"], "node")
+        if not entries:
+            self.doubts["nodes name no type of vehicle, so that none may use them"] += 1
+        theta = _shared(entries, "theta")
+        if theta is not None and abs(theta) <= math.pi + SAME_ANGLE:
+            out["orientation"] = quaternion(float(theta))
+        far = sum(_is_number(e.get("theta")) and abs(e["theta"]) > math.pi + SAME_ANGLE for e in entries)
+        if far:
+            self.doubts["values of theta are beyond ±π: radians are meant; they are kept, but not believed"] += far
+        out[NAME] = mine
+        return out
+
+    def join(
+        self, edge: _Item, place: Mapping[str, int], properties: Sequence[dict[str, Any]], levels: dict[str, _Level]
+    ) -> None:
+        """Put an edge on its level; one to nowhere stays with the node it knows, else with its layout."""
+        ends = [edge.said.get("startNodeId"), edge.said.get("endNodeId")]
+        a, b = (place.get(str(e)) if isinstance(e, (str, int)) else None for e in ends)
+        if a is not None and b is not None:
+            if a == b:
+                self.context.warn(f"the edge {edge.name} leads from a node to itself", where=edge.where)
+            levels.setdefault(edge.level, _Level()).edges.append((edge, a, b))
+            return
+        missing = str(ends[0] if a is None else ends[1])[:60]
+        self.context.warn(f"the edge {edge.name} leads to {missing!r}, which is no node; it is kept", where=edge.where)
+        kept = {"layout": edge.layout, "at": edge.at, "item": edge.said}
+        home = next((k for k in (a, b) if k is not None), None)
+        of = self.document if home is None else properties[home][NAME]
+        of.setdefault("dangling", []).append(kept)
+
+    def check_station(self, station: _Item, place: Mapping[str, int]) -> None:
+        said = station.said.get("interactionNodeIds")
+        if not isinstance(said, list) or not all(isinstance(i, str) for i in said):
+            self.context.warn("needs an array of the nodes where it is reached", where=station.where)
+            return
+        unknown = [i for i in said if i not in place]
+        if unknown:
+            self.context.warn(f"the station is reached at {some(unknown)}, which is no node", where=station.where)
+
+    def network(
+        self, content: _Level, xyz: Array, nodes: Sequence[_Item], properties: Sequence[dict[str, Any]]
+    ) -> Features:
+        """The topology of a level."""
+        sources, targets = [a for _, a, _ in content.edges], [b for _, _, b in content.edges]
+        lines = edge_lines(xyz, sources, targets)
+        rows: list[Properties] = [properties[k] for k in content.nodes]
+        for j, (edge, a, b) in enumerate(content.edges):
+            mine = self.mine(edge, "edge", "startNodeId", "endNodeId")
+            entries = _entries(mine["item"], "edge")
+            if not entries:
+                self.doubts["edges name no type of vehicle, so that none may use them"] += 1
+            out = {"kind": "edge", "source": nodes[a].id, "target": nodes[b].id, **self.named(edge, "edge")}
+            speed = _shared(entries, "maxSpeed")
+            if speed is not None and speed >= 0:
+                out["speed_limit"] = speed
+                mine["item"] = _without(mine["item"], "edge", "maxSpeed")
+            bends = _polyline(entries)
+            if bends is not None:
+                lines[j] = shapely.LineString(bends)
+                mine["item"] = _without(mine["item"], "edge", "trajectory")
+            rows.append({**out, NAME: mine})
+        ids = [nodes[k].id for k in content.nodes] + [edge.id for edge, _, _ in content.edges]
+        geometry = np.concatenate([node_points(xyz[content.nodes]), lines])
+        return from_columns(ids, geometry, rows, "local", {NAME: self.document})
+
+    def stations(self, items: Sequence[_Item]) -> Features:
+        """Stations as objects: points, or without a geometry where the file does not say where they stand."""
+        geometry: NDArray[np.object_] = np.empty(len(items), object)
+        rows: list[Properties] = []
+        for k, item in enumerate(items):
+            said = item.said.get("stationPosition")
+            geometry[k] = NO_GEOMETRY if said is None else shapely.Point(self.position(said, item.where, "station")[:2])
+            mine = self.mine(item, "station")
+            if said is None and "stationPosition" in mine["item"]:
+                del mine["item"]["stationPosition"]
+            rows.append({"kind": "station", "name": item.name, **self.named(item, "station"), NAME: mine})
+        return from_columns([item.id for item in items], geometry, rows, "local", {NAME: {}})
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _word(item: Mapping[str, Any], kind: str) -> str | None:
+    """The member that holds what types of vehicle have of their own."""
+    words = (getattr(FIRST, kind), getattr(SECOND, kind))
+    return next((w for w in words if isinstance(item.get(w), list)), None)
+
+
+def _entries(item: Mapping[str, Any], kind: str) -> list[dict[str, Any]]:
+    """What types of vehicle have of their own at an item; nothing where an entry is no object."""
+    word = _word(item, kind)
+    entries = item[word] if word else []
+    return entries if all(isinstance(e, dict) for e in entries) else []
+
+
+def _shared(entries: Sequence[Mapping[str, Any]], word: str) -> Any:
+    """The number that all entries have in common, else None."""
+    values = [e.get(word) for e in entries]
+    same = values and all(_is_number(v) and v == values[0] and type(v) is type(values[0]) for v in values)
+    return values[0] if same else None
+
+
+def _without(item: Mapping[str, Any], kind: str, word: str) -> dict[str, Any]:
+    """The item, its entries without a word."""
+    list_word = _word(item, kind)
+    if list_word is None:
+        return dict(item)
+    return {**item, list_word: [{w: v for w, v in e.items() if w != word} for e in item[list_word]]}
+
+
+def _trajectory(line: Sequence[Sequence[float]]) -> dict[str, Any]:
+    """A line of n positions as the NURBS of degree 1 through them: knots from 0 to 1, evenly spread."""
+    n = len(line)
+    inner = [k / (n - 1) for k in range(1, n - 1)]
+    points = [{"x": x, "y": y} for x, y in line]
+    return {"degree": 1, "knotVector": [0.0, 0.0, *inner, 1.0, 1.0], "controlPoints": points}
+
+
+def _polyline(entries: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]] | None:
+    """The positions of a trajectory that all entries share, where it is one that ``_trajectory`` writes."""
+    said = entries[0].get("trajectory") if entries else None
+    points = said.get("controlPoints") if isinstance(said, dict) else None
+    if not isinstance(points, list) or len(points) < 3 or any(e.get("trajectory") != said for e in entries):
+        return None
+    line = []
+    for p in points:
+        if not isinstance(p, dict) or not _is_number(p.get("x")) or not _is_number(p.get("y")):
+            return None
+        line.append((float(p["x"]), float(p["y"])))
+    return line if _trajectory(line) == said else None
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``layout.lif.json``: each level is a layout of its own, or the ones that its source has.
+
+    Wgs84 items are brought to local metres (MissingDatum without a datum). CannotConvert where there is no node.
+    """
+    return {"layout.lif.json": _Writer(layers, context).data()}
+
+
+@dataclass(slots=True)
+class _Layout:
+    """A layout being written: what it says of itself, and its items with where they stood."""
+
+    head: dict[str, Any]
+    items: dict[str, list[tuple[tuple[bool, int, tuple[int, str]], dict[str, Any]]]] = field(
+        default_factory=lambda: {"nodes": [], "edges": [], "stations": []}
+    )
+
+
+class _Writer:
+    def __init__(self, layers: Layers, context: WriteContext) -> None:
+        self.layers, self.context = layers, context
+        self.options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
+        self.net = joined(layers, context)
+        if not self.net.nodes:
+            raise CannotConvert("the network has no node, and a layout needs one: supply a network with nodes")
+        self.filled: Counter[str] = Counter()
+        self.lost: Counter[str] = Counter()
+        documents = [own(part.document, NAME) for part in layers.vector("topology").values()]
+        self.documents = [d for d in documents if d]
+        self.layouts: dict[str, _Layout] = {}
+        self.origins: list[dict[str, Any]] = []
+        for document in self.documents:
+            for head in _objects(document.get("layouts")):
+                said = head.get("layoutId")
+                if isinstance(said, str) and is_name(said) and said not in self.layouts:
+                    self.layouts[said] = _Layout({w: v for w, v in head.items() if w not in LISTS})
+        self.dialect = self._dialect()
+
+    def _dialect(self) -> Dialect:
+        """The one that the source's items speak."""
+        known = [n.properties for n in self.net.nodes] + [e.properties for e in self.net.edges]
+        for p in known:
+            said = own(own(p, NAME), "item")
+            for kind in ("node", "edge"):
+                for entry in _entries(said, kind):
+                    spoken = next((d for d in (FIRST, SECOND, THIRD) if d.type in entry), None)
+                    if spoken is not None:
+                        return spoken
+        return FIRST
+
+    def data(self) -> bytes:
+        """The whole text."""
+        names = self._names(self.net.nodes)
+        for node, name in zip(self.net.nodes, names, strict=True):
+            self._put("nodes", node.properties, node.level, name, self._node(node, name))
+        for edge, name in zip(self.net.edges, self._names(self.net.edges), strict=True):
+            self._put("edges", edge.properties, edge.level, name, self._edge(edge, name, names))
+        self._stations()
+        self._dangling()
+        out = self._top()
+        inside = self._origins()
+        placed = {i for _, said in inside for i in said}
+        if inside:
+            out["origins"] = [{**head, "layouts": [self._layout(i) for i in said]} for head, said in inside]
+        rest = [self._layout(i) for i in self.layouts if i not in placed]
+        if rest or not inside:
+            out["layouts"] = rest
+        self._report()
+        return orjson.dumps(_json.ordered(out, ORDER), option=orjson.OPT_INDENT_2) + b"\n"
+
+    def _top(self) -> dict[str, Any]:
+        top: dict[str, Any] = {}
+        for document in reversed(self.documents):
+            top |= own(document, "top")
+        top = {w: v for w, v in top.items() if w not in ("layouts", "origins")}
+        meta = dict(own(top, "metaInformation"))
+        if "lifId" not in meta and "projectIdentification" not in meta:
+            meta["projectIdentification"] = self.context.title
+            self.context.fill("metaInformation.projectIdentification", self.context.title, "no source names it")
+        for word, value in (("creator", self.options.creator), ("exportTimestamp", EPOCH), ("lifVersion", VERSION)):
+            if word not in meta:
+                meta[word] = value
+                self.context.fill(f"metaInformation.{word}", value, "no source names it")
+        return {**top, "metaInformation": meta}
+
+    def _origins(self) -> list[tuple[dict[str, Any], list[str]]]:
+        """(head, ids of its layouts) of the origins that the source has; other layouts join the first one."""
+        found: list[tuple[dict[str, Any], list[str]]] = []
+        placed: set[str] = set()
+        for document in self.documents:
+            for origin in _objects(document.get("origins")):
+                head = {w: v for w, v in own(origin, "head").items() if w != "layouts"}
+                if any(head == known for known, _ in found):
+                    continue
+                ids = origin.get("layouts")
+                said = [i for i in ids if isinstance(i, str)] if isinstance(ids, list) else []
+                said = [i for i in dict.fromkeys(said) if i in self.layouts and i not in placed]
+                placed |= set(said)
+                found.append((head, said))
+        if found:
+            found[0][1].extend(i for i in self.layouts if i not in placed)
+        return found
+
+    def _layout(self, i: str) -> dict[str, Any]:
+        layout = self.layouts[i]
+        out = dict(layout.head)
+        for word, items in layout.items.items():
+            if items or word != "stations":
+                out[word] = [item for _, item in sorted(items, key=lambda t: t[0])]
+        return out
+
+    def _put(self, word: str, p: Properties, level: str, name: str, item: dict[str, Any]) -> None:
+        """Put an item into its layout: the one its source says, the first of its level, or a new one."""
+        mine = own(p, NAME)
+        said, at = mine.get("layout"), mine.get("at")
+        if not isinstance(said, str) or said not in self.layouts:
+            of_level = (i for i, v in self.layouts.items() if v.head.get("layoutLevelId", GROUND) == level)
+            said = next(of_level, None)
+        if said is None:
+            said = unique_ids([level], set(self.layouts))[0]
+            head = {"layoutId": said, "layoutVersion": "1", **({} if level == GROUND else {"layoutLevelId": level})}
+            self.layouts[said] = _Layout(head)
+            self.filled["layouts"] += 1
+        known = isinstance(at, int) and not isinstance(at, bool)
+        key = (not known, at if isinstance(at, int) else 0, natural(name))
+        self.layouts[said].items[word].append((key, item))
+
+    def _names(self, items: Sequence[Node | Edge]) -> list[str]:
+        """The ids of the file: those of the sources, where they are distinct."""
+        wanted = []
+        for item in items:
+            said = own(item.properties, NAME).get("id")
+            wanted.append(said if isinstance(said, str) and is_name(said) else item.id)
+        out = unique_ids(wanted)
+        if again := [a for a, b in zip(wanted, out, strict=True) if a != b]:
+            self.context.warn(f"{len(again)} ids stood for several items and got a number: {some(again)}")
+        return out
+
+    def _base(self, p: Properties, kind: str, name: str) -> dict[str, Any]:
+        """The members of an item's source, with its id and its name."""
+        item = {w: v for w, v in own(own(p, NAME), "item").items() if w != f"{kind}Id"}
+        out: dict[str, Any] = {f"{kind}Id": name, **item}
+        said = p.get("name")
+        if isinstance(said, str) and said not in ("", name):
+            out[f"{kind}Name"] = said
+        return out
+
+    def _vehicles(
+        self, p: Properties, out: dict[str, Any], kind: str, template: Mapping[str, Any]
+    ) -> list[dict[str, Any]]:
+        """The entries of types of vehicle, copies; one for the type of the options where another format tells none.
+
+        An item of a LIF file without entries stays so: no vehicle may use it.
+        """
+        word = _word(out, kind)
+        entries = [dict(e) for e in _entries(out, kind)]
+        if word is None:
+            if NAME in p:
+                return []
+            word = str(getattr(self.dialect, kind))
+            entries = [{**self.dialect.type_of(self.options.vehicle_type), **template}]
+            self.filled[f"{kind}s"] += 1
+        elif len(entries) != count(out[word]):
+            return []
+        out[word] = entries
+        return entries
+
+    def _node(self, node: Node, name: str) -> dict[str, Any]:
+        p = node.properties
+        out = self._base(p, "node", name)
+        out["nodePosition"] = {**own(out, "nodePosition"), "x": _metres(node.x), "y": _metres(node.y)}
+        entries = self._vehicles(p, out, "node", {})
+        if p.get("orientation") is not None:
+            self.lost["tilts of nodes"] += not is_flat(p["orientation"])
+            for entry in entries:
+                theta = said_yaw(entry.get("theta"), p["orientation"])
+                if theta is not None:
+                    entry["theta"] = theta
+        self.lost["altitudes of nodes"] += bool(node.z)
+        self.lost["attributes of nodes"] += bool(p.keys() - CANONICAL_NODE)
+        return out
+
+    def _edge(self, edge: Edge, name: str, names: Sequence[str]) -> dict[str, Any]:
+        p = edge.properties
+        out = self._base(p, "edge", name)
+        out |= {"startNodeId": names[edge.source], "endNodeId": names[edge.target]}
+        usual = {"vehicleOrientation": 0.0, "orientationType": "TANGENTIAL", "rotationAllowed": False}
+        entries = self._vehicles(p, out, "edge", usual if self.dialect == FIRST else {"orientationType": "TANGENTIAL"})
+        speed = p.get("speed_limit")
+        at = (np.round(shapely.get_coordinates(edge.geometry), METRES) + 0.0).tolist()
+        for entry in entries:
+            if _is_number(speed):
+                entry["maxSpeed"] = speed
+            if len(at) > 2 and edge.geometry.geom_type == "LineString":
+                entry["trajectory"] = _trajectory(at)
+        self.lost["attributes of edges"] += bool(p.keys() - CANONICAL_EDGE)
+        return out
+
+    def _stations(self) -> None:
+        for key, part in self.layers.vector("objects").items():
+            if key.name != NAME:
+                continue
+            shapes = part.in_local(self.layers.frame)
+            for i, p, shape in zip(part.ids, part.properties, shapes, strict=True):
+                if p.get("kind") != "station":
+                    self.lost["objects that are no stations"] += 1
+                    continue
+                said = own(p, NAME).get("id")
+                name = said if isinstance(said, str) and is_name(said) else i
+                out = self._base(p, "station", name)
+                if not shape.is_empty:
+                    at = shapely.centroid(shape)
+                    place = {"x": _metres(at.x), "y": _metres(at.y)}
+                    out["stationPosition"] = {**own(out, "stationPosition"), **place}
+                if not isinstance(out.get("interactionNodeIds"), list):
+                    out["interactionNodeIds"] = []
+                    self.filled["stations"] += 1
+                self.lost["attributes of stations"] += bool(p.keys() - CANONICAL_STATION)
+                self._put("stations", p, key.level, name, out)
+
+    def _dangling(self) -> None:
+        """Edges to nowhere, of the nodes that know them and of the files as a whole, each once."""
+        lists = [own(node.properties, NAME).get("dangling") for node in self.net.nodes]
+        lists += [document.get("dangling") for document in self.documents]
+        seen = set()
+        for edge in (e for said in lists for e in _objects(said)):
+            item, key = own(edge, "item"), orjson.dumps(edge, option=orjson.OPT_SORT_KEYS)
+            if isinstance(item.get("edgeId"), str) and key not in seen:
+                seen.add(key)
+                self._put("edges", {NAME: edge}, GROUND, item["edgeId"], item)
+
+    def _report(self) -> None:
+        context = self.context
+        why = "no source names a type of vehicle"
+        for kind in ("nodes", "edges"):
+            if self.filled[kind]:
+                context.fill(
+                    f"{kind}: type of vehicle", self.options.vehicle_type, f"{self.filled[kind]} {kind}: {why}"
+                )
+        if self.filled["edges"]:
+            context.fill("edges: orientation", "TANGENTIAL, no rotation", f"{self.filled['edges']} edges do not say it")
+        if self.filled["layouts"]:
+            context.fill(
+                "layouts", f"{self.filled['layouts']}, one for each level", "no source has a layout of the level"
+            )
+        if self.filled["stations"]:
+            context.fill("stations: interactionNodeIds", [], f"{self.filled['stations']} stations name no nodes")
+        for what, n in sorted(self.lost.items()):
+            context.drop(what, n, "LIF has no place for it")
+
+
+def _objects(said: Any) -> list[dict[str, Any]]:
+    """The objects of a list."""
+    return [v for v in said if isinstance(v, dict)] if isinstance(said, list) else []
+
+
+def _metres(value: float) -> float:
+    return round(value, METRES) + 0.0
+
+
+# --- the format ------------------------------------------------------------------------------------------------------
+
+
+def detect(name: str, data: bytes) -> bool:  # noqa: ARG001 - one signature for all formats
+    """A JSON object with LIF's two members on top."""
+    if data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")[:1] != b"{" or b'"metaInformation"' not in data:
+        return False
+    if b'"layouts"' not in data or b'"FeatureCollection"' in data:
+        return False
+    if len(data) > 2**20:
+        return b'"nodePosition"' in data
+    try:
+        top = orjson.loads(data.removeprefix(b"\xef\xbb\xbf"))
+    except orjson.JSONDecodeError:
+        return b'"lifVersion"' in data
+    return "metaInformation" in top and ("layouts" in top or "origins" in top)
+
+
+def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
+    """The networks, and the stations that came from a LIF file."""
+    return [key for key in keys if key.layer == "topology" or (key.layer == "objects" and key.name == NAME)]
+
+
+register(
+    Format(
+        name=NAME,
+        title="Layout Interchange Format (VDMA LIF)",
+        files=("layout.lif.json",),
+        media_types=("application/json",),
+        carries=frozenset({"topology", "objects"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        write_options=WriteOptions,
+        family=NAME,
+        rank=37,
+        extensions=(".lif.json", ".lif", ".json"),
+        choose=choose,
+    )
+)

@@ -1,0 +1,447 @@
+"""lif: real layouts come back the same, facts hold on every level, what all vehicles share is canonical."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from app import formats
+from app.bundle import Hints
+from app.convert import offline
+from app.errors import CannotConvert, MissingDatum, TooLarge, UnreadableFile
+from app.formats import Group, Limits, ReadContext, WriteContext, get_format
+from app.formats.lif import WriteOptions
+from app.model.features import Features, features
+from app.model.frame import Datum, Level
+from app.model.layers import Layers, PartKey
+
+FORMAT = get_format("lif")
+SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "lif"
+FACTS: dict[str, Any] = json.loads((SAMPLES / "facts.json").read_text())
+NETWORK = PartKey("topology", "ground", "network")
+Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
+
+
+def read(data: Any, **context: Any) -> tuple[Layers, ReadContext]:
+    said = data if isinstance(data, bytes) else json.dumps(data).encode()
+    told = ReadContext(main="layout.lif.json", **context)
+    return formats.read(Group(FORMAT, "layout.lif.json", {"layout.lif.json": said}), told), told
+
+
+def write(part: Features | Layers, **context: Any) -> tuple[bytes, WriteContext]:
+    told = WriteContext(**context)
+    layers = part if isinstance(part, Layers) else Layers({NETWORK: part})
+    files = formats.write(FORMAT, layers, told)
+    assert list(files) == ["layout.lif.json"]
+    return files["layout.lif.json"], told
+
+
+def warnings(context: ReadContext | WriteContext) -> str:
+    return "\n".join(p.problem for p in context.warnings)
+
+
+def item(layers: Layers, i: str, layer: Any = "topology") -> dict[str, Any]:
+    found = [
+        p for part in layers.vector(layer).values() for k, p in zip(part.ids, part.properties, strict=True) if k == i
+    ]
+    assert len(found) == 1, i
+    return dict(found[0])
+
+
+def check(data: bytes) -> dict[str, Any]:
+    """The required members of LIF 1.0, and that references lead somewhere."""
+    top: dict[str, Any] = json.loads(data)
+    meta = top["metaInformation"]
+    assert all(isinstance(meta[w], str) for w in ("projectIdentification", "creator", "exportTimestamp", "lifVersion"))
+    nodes: list[str] = []
+    for layout in top["layouts"]:
+        assert isinstance(layout["layoutId"], str)
+        for node in layout["nodes"]:
+            nodes.append(node["nodeId"])
+            assert all(isinstance(node["nodePosition"][w], float) for w in "xy")
+            assert node["vehicleTypeNodeProperties"]
+            for entry in node["vehicleTypeNodeProperties"]:
+                assert isinstance(entry["vehicleTypeId"], str)
+    assert len(set(nodes)) == len(nodes)
+    for edge in (e for layout in top["layouts"] for e in layout["edges"]):
+        assert {edge["startNodeId"], edge["endNodeId"]} <= set(nodes)
+        assert edge["vehicleTypeEdgeProperties"]
+        for entry in edge["vehicleTypeEdgeProperties"]:
+            assert isinstance(entry["vehicleTypeId"], str)
+            assert isinstance(entry["rotationAllowed"], bool)
+            line = entry.get("trajectory")
+            if line:
+                assert len(line["knotVector"]) == len(line["controlPoints"]) + line["degree"] + 1
+    return top
+
+
+# --- real files ------------------------------------------------------------------------------------------------------
+
+
+def real(shared: Path) -> list[Path]:
+    return sorted((shared / "data" / "lif").rglob("*.json"))
+
+
+def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_json: dict[str, Any]) -> None:
+    assert len(real(shared)) == sum(f.get("kind") == "lif" for f in facts_json.values()) == 9
+    for path in real(shared):
+        data = path.read_bytes()
+        assert formats.detect(path.name, data) is FORMAT, path
+        layers, context = read(data)
+        served, told = write(layers)
+        assert same("lif", {path.name: data}, {"layout.lif.json": served}) == [], path
+        assert (told.dropped, told.template, told.warnings) == ([], [], [])
+        assert json.loads(served)["metaInformation"] == json.loads(data)["metaInformation"]
+        assert write(read(served)[0])[0] == served
+        assert ("is a draft" in warnings(context)) == ("2_0" in str(path))
+        converted = offline({path.name: data}, "lif").files["layout.lif.json"]
+        assert same("lif", {path.name: data}, {"layout.lif.json": converted}) == [], path
+
+
+def test_facts_of_real_files_hold_in_the_canonical_layers(shared: Path, facts_json: dict[str, Any]) -> None:
+    for path in real(shared):
+        fact = facts_json[str(path.relative_to(shared / "data"))]["facts"]
+        layers, _ = read(path.read_bytes())
+        for layout in fact["layouts"]:
+            level = layout["layoutLevelId"] or "ground"
+            kinds = [p["kind"] for part in layers.vector("topology", level).values() for p in part.properties]
+            assert kinds.count("node") == layout["nodes"]
+            assert kinds.count("edge") == layout["edges"]
+            assert sum(len(part) for part in layers.vector("objects", level).values()) == layout["stations"]
+
+
+# --- our sample ------------------------------------------------------------------------------------------------------
+
+
+def test_facts_of_the_sample() -> None:
+    fact = FACTS["plant.lif.json"]
+    layers, context = read((SAMPLES / "plant.lif.json").read_bytes())
+    for kind, word, layer in (
+        ("node", "nodes", "topology"),
+        ("edge", "edges", "topology"),
+        ("station", "stations", "objects"),
+    ):
+        for level, n in fact[word].items():
+            found = layers.vector(layer, level).values()  # type: ignore[arg-type]
+            assert sum(p["kind"] == kind for part in found for p in part.properties) == n
+    rows = [(i, p, g) for part in layers.vector("topology").values()
+            for i, p, g in zip(part.ids, part.properties, part.geometry, strict=True)]  # fmt: skip
+    assert {i: p["speed_limit"] for i, p, _ in rows if "speed_limit" in p} == fact["speed_limits"]
+    assert [i for i, _, g in rows if shapely.get_num_coordinates(g) > 2] == fact["bent"]
+    assert [i for i, p, _ in rows if "orientation" in p] == fact["turned"]
+    points = [g for _, p, g in rows if p["kind"] == "node"]
+    assert shapely.total_bounds(points).tolist() == [*fact["bounds"][0], *fact["bounds"][1]]
+    assert sum(len(p["lif"].get("dangling", ())) for _, p, _ in rows) == fact["dangling"]
+    assert "leads to 'gone'" in warnings(context)
+    assert "radians" in warnings(context)
+    assert {key.level for key in layers.parts} == {"0", "1"}
+
+
+def test_the_sample_in_full(same: Same) -> None:
+    data = (SAMPLES / "plant.lif.json").read_bytes()
+    layers, _ = read(data)
+    dock = item(layers, "N2")
+    assert dock["name"] == "Dock"
+    assert dock["orientation"] == pytest.approx([0, 0, math.sin(1.57 / 2), math.cos(1.57 / 2)])
+    assert "orientation" not in item(layers, "N1")
+    main = item(layers, "E1#2")
+    assert (main["source"], main["target"], main["name"]) == ("N1", "N2", "Main")
+    assert main["lif"]["id"] == "E1"
+    assert item(layers, "lift")["target"] == "U1"
+    press = item(layers, "S2", "objects")
+    assert (press["kind"], press["name"]) == ("station", "Press")
+    stations = layers.parts[PartKey("objects", "0", "lif")]
+    assert isinstance(stations, Features)
+    assert stations.geometry[0].equals(shapely.Point(11, -1))
+    assert stations.geometry[1].is_empty
+    served, told = write(layers)
+    assert same("lif", {"a.json": data}, {"b.json": served}) == []
+    assert (told.dropped, told.template, told.warnings) == ([], [], [])
+    top = json.loads(served)
+    assert [layout["layoutId"] for layout in top["layouts"]] == ["Hall", "Upstairs", "Empty"]
+    assert [n["nodeId"] for n in top["layouts"][0]["nodes"]] == ["N2", "N1", "E1"]
+    assert [e["edgeId"] for e in top["layouts"][0]["edges"]] == ["E1", "E0", "curve", "lift", "nowhere"]
+
+
+def test_order_does_not_depend_on_how_the_items_are_stored() -> None:
+    layers, _ = read((SAMPLES / "plant.lif.json").read_bytes())
+    turned = {
+        key: part.take(list(reversed(range(len(part)))))
+        for key, part in layers.parts.items()
+        if isinstance(part, Features)
+    }
+    turned = {
+        k: Features(
+            v.ids, v.geometry, tuple(dict(sorted(p.items(), reverse=True)) for p in v.properties), v.local, v.document
+        )
+        for k, v in turned.items()
+    }
+    assert write(Layers(dict(reversed(turned.items())), None, layers.levels))[0] == write(layers)[0]
+
+
+def test_what_an_edit_changes_is_served() -> None:
+    layers, _ = read((SAMPLES / "plant.lif.json").read_bytes())
+    key = PartKey("topology", "0", "network")
+    part = layers.parts[key]
+    assert isinstance(part, Features)
+    properties = [dict(p) for p in part.properties]
+    place = part.index()
+    properties[place["N2"]] |= {"name": "Ramp", "orientation": [0.0, 0.0, 1.0, 0.0]}
+    properties[place["E1#2"]]["speed_limit"] = 0.75
+    geometry = part.geometry.copy()
+    geometry[place["N2"]] = shapely.Point(12, 1)
+    added = features([("new", shapely.Point(3, 3), {"kind": "node"})], "local")
+    changed = Features(
+        (*part.ids, "new"), np.concatenate([geometry, added.geometry]), (*properties, *added.properties),
+        np.concatenate([part.local, added.local]), part.document,
+    )  # fmt: skip
+    served, told = write(Layers({**layers.parts, key: changed}, None, layers.levels))
+    hall = json.loads(served)["layouts"][0]
+    ramp = hall["nodes"][0]
+    assert (ramp["nodeId"], ramp["nodeName"], ramp["nodePosition"]) == ("N2", "Ramp", {"x": 12.0, "y": 1.0})
+    assert [e["theta"] for e in ramp["vehicleTypeNodeProperties"]] == pytest.approx([math.pi, math.pi])
+    assert ramp["vehicleTypeNodeProperties"][0]["actions"]
+    assert [e["maxSpeed"] for e in hall["edges"][0]["vehicleTypeEdgeProperties"]] == [0.75, 0.75]
+    assert hall["nodes"][-1]["nodeId"] == "new"
+    assert hall["nodes"][-1]["vehicleTypeNodeProperties"] == [{"vehicleTypeId": "any"}]
+    assert [t["what"] for t in told.template] == ["nodes: type of vehicle"]
+
+
+def test_drafts_speak_their_own_words(shared: Path) -> None:
+    drafts = sorted((shared / "data" / "lif" / "vdma_lif_2_0_draft").glob("*.json"))
+    types = []
+    for path in drafts:
+        layers, _ = read(path.read_bytes())
+        key = PartKey("topology", "0", "network")
+        part = layers.parts[key]
+        assert isinstance(part, Features)
+        edge = {"kind": "edge", "source": "new", "target": "N1"}
+        rows: list[tuple[str, Any, dict[str, Any]]] = [
+            ("new", shapely.Point(3, 3), {"kind": "node"}),
+            ("e", shapely.LineString([(3, 3), (0, 0)]), edge),
+        ]
+        added = features(rows, "local")
+        both = Features(
+            (*part.ids, *added.ids), np.concatenate([part.geometry, added.geometry]),
+            (*part.properties, *added.properties), np.concatenate([part.local, added.local]), part.document,
+        )  # fmt: skip
+        top = json.loads(write(Layers({**layers.parts, key: both}))[0])
+        layout = (top["layouts"] if "layouts" in top else top["origins"][0]["layouts"])[0]
+        types.append(layout["nodes"][-1]["mobileRobotTypeNodeProperties"])
+        assert "mobileRobotTypeEdgeProperties" in layout["edges"][-1]
+    assert types == [
+        [{"mobileRobotTypeId": "any"}],
+        [{"mobileRobotTypes": [{"manufacturer": "any", "seriesName": "any"}]}],
+    ]
+
+
+# --- from other formats ----------------------------------------------------------------------------------------------
+
+
+def street(*names: str, **more: Any) -> Features:
+    rows: list[tuple[str, Any, dict[str, Any]]] = [
+        (i, shapely.Point(k, 0), {"kind": "node", "name": i}) for k, i in enumerate(names)
+    ]
+    for k in range(len(names) - 1):
+        line = shapely.LineString([(k, 0), (k + 0.5, 1), (k + 1, 0)])
+        rows.append((f"e{k}", line, {"kind": "edge", "source": names[k], "target": names[k + 1], **more}))
+    return features(rows, "local")
+
+
+def test_a_network_of_another_format() -> None:
+    part = street("A", "B", speed_limit=2.5, action="row_traversal")
+    up = PartKey("topology", "up", "network")
+    layers = Layers({NETWORK: part, up: street("A", "C")}, None, (Level(), Level("up", 3.0)))
+    served, told = write(layers, title="farm", options=WriteOptions(vehicle_type="robot"))
+    top = check(served)
+    assert [(v["layoutId"], v.get("layoutLevelId")) for v in top["layouts"]] == [("ground", None), ("up", "up")]
+    assert [[n["nodeId"] for n in v["nodes"]] for v in top["layouts"]] == [["A", "B"], ["C", "A#2"]]
+    entry = top["layouts"][0]["edges"][0]["vehicleTypeEdgeProperties"][0]
+    assert entry["vehicleTypeId"] == "robot"
+    assert entry["maxSpeed"] == 2.5
+    assert entry["trajectory"]["controlPoints"][1] == {"x": 0.5, "y": 1.0}
+    assert [(d["what"], d["count"]) for d in told.dropped] == [("attributes of edges", 1)]
+    assert "got a number" in warnings(told)
+    back, _ = read(served)
+    assert item(back, "e0")["speed_limit"] == 2.5
+    line = back.parts[NETWORK]
+    assert isinstance(line, Features)
+    assert shapely.get_num_coordinates(line.geometry[2]) == 3
+    assert write(back)[0] == served
+
+
+def test_tmap2_to_lif_and_back(shared: Path) -> None:
+    farm = shared / "data" / "environment_template" / "riseholme_park_farm_vineyard" / "config" / "topological"
+    data = (farm / "network.tmap2.yaml").read_bytes()
+    made = offline({"network.tmap2.yaml": data}, "lif").files["layout.lif.json"]
+    top = check(made)
+    tmap2 = get_format("tmap2")
+    group = Group(tmap2, "n.tmap2.yaml", {"n.tmap2.yaml": data})
+    part = formats.read(group, ReadContext(main="n.tmap2.yaml")).parts[NETWORK]
+    assert isinstance(part, Features)
+    nodes = {i: (g.x, g.y) for i, g in zip(part.ids, part.geometry, strict=True) if g.geom_type == "Point"}
+    found = {n["nodeId"]: (n["nodePosition"]["x"], n["nodePosition"]["y"]) for n in top["layouts"][0]["nodes"]}
+    assert found.keys() == nodes.keys()
+    assert all(found[i] == pytest.approx(at) for i, at in nodes.items())
+    assert {(e["edgeId"], e["startNodeId"], e["endNodeId"]) for e in top["layouts"][0]["edges"]} == {
+        (i, p["source"], p["target"]) for i, p in zip(part.ids, part.properties, strict=True) if p["kind"] == "edge"
+    }
+    assert offline({"layout.lif.json": made}, "tmap2").files
+
+
+def test_through_our_geojson_nothing_is_lost(same: Same) -> None:
+    data = (SAMPLES / "plant.lif.json").read_bytes()
+    layers, _ = read(data)
+    made = formats.write(get_format("geojson"), layers, WriteContext())["map.geojson"]
+    assert formats.detect("map.geojson", made) is get_format("geojson")
+    told = ReadContext(main="map.geojson")
+    again = formats.read(Group(get_format("geojson"), "map.geojson", {"map.geojson": made}), told)
+    assert same("lif", {"a.json": data}, {"b.json": write(again)[0]}) == []
+
+
+def test_places_on_earth_need_a_datum_and_nodes_are_needed() -> None:
+    part = features([("a", shapely.Point(-0.5, 53.0), {"kind": "node"})], "wgs84")
+    with pytest.raises(MissingDatum):
+        write(part)
+    node = check(write(Layers({NETWORK: part}, Datum(53.0, -0.5)))[0])["layouts"][0]["nodes"][0]
+    assert node["nodePosition"] == {"x": 0.0, "y": 0.0}
+    with pytest.raises(CannotConvert, match="supply"):
+        write(features([("e", shapely.Point(1, 1), {"kind": "edge"})], "local"))
+
+
+# --- bad and doubtful files ------------------------------------------------------------------------------------------
+
+
+def layout(nodes: Any = None, edges: Any = None, **more: Any) -> dict[str, Any]:
+    base = [{"nodeId": i, "nodePosition": {"x": k, "y": 0}, "vehicleTypeNodeProperties": [{"vehicleTypeId": "t"}]}
+            for k, i in enumerate("AB")]  # fmt: skip
+    meta = {"projectIdentification": "p", "creator": "c", "exportTimestamp": "t", "lifVersion": "1.0.0"}
+    one = {"layoutId": "L", "nodes": base + (nodes or []), "edges": edges or [], **more}
+    return {"metaInformation": meta, "layouts": [one]}
+
+
+AT = {"x": 1, "y": 2}
+
+
+@pytest.mark.parametrize(
+    ("data", "where", "reason"),
+    [
+        ([], "layouts", "array"),
+        ({"layouts": 5}, "layouts", "array"),
+        ({"layouts": [5]}, "layouts[0]", "object"),
+        ({"layouts": [{}]}, "layouts[0].layoutId", "id"),
+        ({"layouts": [{"layoutId": "a"}, {"layoutId": "a"}]}, "layouts[1].layoutId", "twice"),
+        ({"layouts": [], "origins": [5]}, "origins[0]", "object"),
+        (layout(layoutLevelId=5), "layouts[0].layoutLevelId", "text"),
+        (layout(layoutLevelId="a\nb"), "layouts[0].layoutLevelId", "control"),
+        (layout(stations={}), "layouts[0].stations", "array"),
+        (layout([5]), "layouts[0].nodes[2]", "object"),
+        (layout([{"nodePosition": AT}]), "layouts[0].nodes[2].nodeId", "id"),
+        (layout([{"nodeId": "", "nodePosition": AT}]), "layouts[0].nodes[2].nodeId", "characters"),
+        (layout([{"nodeId": "C"}]), "layouts[0].nodes[2].nodePosition", "x and y"),
+        (layout([{"nodeId": "C", "nodePosition": {"x": "1", "y": 0}}]), "layouts[0].nodes[2].nodePosition.x", "number"),
+        (layout(edges=[{"edgeId": None}]), "layouts[0].edges[0].edgeId", "id"),
+        (
+            layout(stations=[{"stationId": "S", "stationPosition": 5}]),
+            "layouts[0].stations[0].stationPosition",
+            "x and",
+        ),
+    ],
+)
+def test_bad_files_are_named(data: Any, where: str, reason: str) -> None:
+    with pytest.raises(UnreadableFile) as caught:
+        read(data)
+    problem = caught.value.problems[0]
+    assert problem.where == where
+    assert reason in problem.problem
+    assert problem.file == "layout.lif.json"
+
+
+def test_limits() -> None:
+    with pytest.raises(UnreadableFile, match="JSON") as caught:
+        read(b'{"layouts": [\n}')
+    assert caught.value.problems[0].line == 2
+    with pytest.raises(UnreadableFile, match="deeper"):
+        read(b'{"layouts":' + b"[" * 200 + b"]" * 200 + b"}")
+    with pytest.raises(TooLarge):
+        read(layout(), limits=Limits(features=1))
+    with pytest.raises(UnreadableFile, match="finite"):
+        read(layout([{"nodeId": "C", "nodePosition": {"x": 1e9, "y": 0}}]))
+
+
+@pytest.mark.parametrize(
+    ("data", "warning"),
+    [
+        (layout([{"nodeId": 7, "nodePosition": AT}]), "is no text"),
+        (layout([{"nodeId": "A", "nodePosition": AT}]), "share an id"),
+        (layout([{"nodeId": "C", "nodePosition": AT}]), "name no type of vehicle"),
+        (layout([{"nodeId": "C", "nodePosition": AT, "vehicleTypeNodeProperties": [5]}]), "name no type of vehicle"),
+        (layout(edges=[{"edgeId": "e", "startNodeId": "A", "endNodeId": "A"}]), "to itself"),
+        (layout(edges=[{"edgeId": "e", "startNodeId": "A", "endNodeId": "X"}]), "is no node"),
+        (layout(edges=[{"edgeId": "e", "startNodeId": None, "endNodeId": ["X"]}]), "is no node"),
+        (layout(stations=[{"stationId": "S", "interactionNodeIds": ["X"]}]), "reached at X"),
+        (layout(stations=[{"stationId": "S"}]), "needs an array"),
+        ({"layouts": layout()["layouts"]}, "read as version 1.0"),
+        ({**layout(), "metaInformation": {"lifVersion": "3.1"}}, "is a draft"),
+    ],
+)
+def test_what_is_doubtful_is_taken_with_a_warning(data: dict[str, Any], warning: str, same: Same) -> None:
+    layers, context = read(data)
+    assert warning in warnings(context)
+    served, _ = write(layers)
+    assert write(read(served)[0])[0] == served
+    if "is no node" in warning or "itself" in warning:
+        assert same("lif", {"a.json": json.dumps(data).encode()}, {"b.json": served}) == []
+
+
+def test_a_layout_without_a_level_goes_where_it_is_asked_to() -> None:
+    layers, _ = read(layout(), level="cellar")
+    assert {k.level for k in layers.parts} == {"cellar"}
+    assert "layoutLevelId" not in json.loads(write(layers)[0])["layouts"][0]
+    made = offline({"a.json": json.dumps(layout()).encode()}, "lif", hints=Hints("lif")).files["layout.lif.json"]
+    assert check(made)
+
+
+def test_odd_values_of_our_words_are_served_as_far_as_they_go() -> None:
+    for value in (5, "x", [1], {"a": 1}, None, [[1]], True, {"layoutId": 3}, [{"layoutId": "x", "head": 4}]):
+        own = dict.fromkeys(("id", "layout", "at", "item", "dangling"), value)
+        words = ("vehicleTypeNodeProperties", "vehicleTypeEdgeProperties", "nodePosition", "trajectory", "nodeName")
+        inner = {"item": dict.fromkeys(words, value), "dangling": [{"item": {"edgeId": "z"}, "layout": value}]}
+        rows: list[tuple[str, Any, dict[str, Any]]] = [
+            ("a", shapely.Point(0, 0), {"kind": "node", "name": value, "orientation": value, "lif": own}),
+            ("b", shapely.Point(1, 0), {"kind": "node", "orientation": [0, 0, 0, 1], "lif": inner}),
+            (
+                "e",
+                shapely.Point(1, 0),
+                {"kind": "edge", "source": "a", "target": "b", "speed_limit": value, "lif": own},
+            ),
+            ("f", shapely.Point(1, 0), {"kind": "edge", "source": "b", "target": "a", "speed_limit": 1, "lif": inner}),
+        ]
+        stations = features([("s", shapely.Point(1, 0), {"kind": "station", "name": value, "lif": own})], "local")
+        document = {"lif": dict.fromkeys(("top", "layouts", "origins", "dangling"), value)}
+        layers = Layers({NETWORK: features(rows, "local", document), PartKey("objects", "ground", "lif"): stations})
+        top = json.loads(write(layers)[0])
+        layouts = top.get("layouts", []) + [v for o in top.get("origins", []) for v in o["layouts"]]
+        assert sum(len(v["nodes"]) for v in layouts) == 2
+
+
+@pytest.mark.parametrize(
+    ("data", "is_one"),
+    [
+        (json.dumps(layout()).encode(), True),
+        (b"\xef\xbb\xbf " + json.dumps(layout()).encode(), True),
+        (json.dumps({"a": layout()}).encode(), False),
+        (b'{"metaInformation": {"lifVersion": 1}, "layouts": [', True),
+        (b'{"metaInformation": 1, "layouts": [', False),
+        (b'["metaInformation", "layouts"]', False),
+    ],
+)
+def test_detection(data: bytes, is_one: bool) -> None:
+    assert FORMAT.detect("a.json", data) is is_one
