@@ -40,7 +40,7 @@ MAX_KNOWN = 4096
 MAX_SOURCES = 10_000
 MAX_TOKEN = 512
 
-OPEN = frozenset({"/healthz", "/readyz", "/docs", "/openapi.json"})
+OPEN = frozenset({"/", "/healthz", "/readyz", "/docs", "/openapi.json"})
 """Addresses that need no token; also all below /docs/ (the pages' own files)."""
 
 _ENVIRONMENT = re.compile(r"/(?:api/v1/environments|maps)/([^/]+)(?:/.*)?", re.DOTALL)

@@ -9,7 +9,7 @@ from fastapi import FastAPI, Request
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
-from starlette.responses import Response
+from starlette.responses import RedirectResponse, Response
 
 from app import formats, parameters
 from app.api.access import AtLeast, is_open
@@ -62,6 +62,10 @@ def add_pages(app: FastAPI) -> None:
         data = resources.files(_PACKAGE).joinpath("static", name).read_bytes()
         return Response(data, headers={"cache-control": "public, max-age=86400"}, media_type=ASSETS[name])
 
+    async def front(_: Request) -> Response:
+        return RedirectResponse("/docs", 307)  # until there is a page for operators
+
+    app.router.add_route("/", front, methods=["GET"], include_in_schema=False)
     app.router.add_route("/openapi.json", schema, methods=["GET"], include_in_schema=False)
     app.router.add_route("/docs", docs, methods=["GET"], include_in_schema=False)
     app.router.add_route("/docs/{name}", asset, methods=["GET"], include_in_schema=False)

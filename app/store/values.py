@@ -168,7 +168,7 @@ class Version:
         order = ("raw", "derived", "generated", "template")
         out: dict[str, str] = {}
         for layer in INFORMATION_LAYERS:
-            kinds = {e.provenance.information for e in self.parts if e.key.layer == layer}
+            kinds = {e.provenance.information for e in self.parts if e.key.layer == layer and e.count}
             if layer == "location" and self.datum is not None and not kinds:
                 kinds = {"raw"}
             out[layer] = next((kind for kind in order if kind in kinds), "missing")

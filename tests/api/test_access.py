@@ -164,4 +164,4 @@ def test_the_environment_of_an_address(path: str, environment: str | None) -> No
 
 def test_open_addresses() -> None:
     assert all(map(is_open, ("/healthz", "/readyz", "/docs", "/docs/swagger-ui.css", "/openapi.json")))
-    assert not any(map(is_open, ("/", "/metrics", "/docsx", "/healthz/", "/api/v1/formats", "/maps/a/b")))
+    assert not any(map(is_open, ("//", "/metrics", "/docsx", "/healthz/", "/api/v1/formats", "/maps/a/b")))

@@ -230,7 +230,7 @@ def test_a_token_over_a_warm_answer(guarded: dict[str, Api]) -> None:
 def test_open_addresses(guarded: dict[str, Api]) -> None:
     for path in ("/healthz", "/readyz", "/docs", "/openapi.json", "/docs/swagger-ui-bundle.js"):
         guarded["nobody"].get(path)
-    for path in ("/", "/nothing", "/api/v1", "/api/v1/nothing", "/metrics"):
+    for path in ("/nothing", "/api/v1", "/api/v1/nothing", "/metrics"):
         guarded["nobody"].problem("GET", path, 401)
 
 
@@ -460,3 +460,9 @@ def test_settings_reach_the_pool(tmp_path: Path) -> None:
         answer = api.upload("farm", {"n.tmap2.yaml": samples.tmap2()}, expect=413)
         assert "5" in problem(answer)["detail"]
     assert API == "/api/v1"
+
+
+def test_a_browser_at_the_front_door_is_shown_the_documentation(api: Api) -> None:
+    answer = api.as_(None).http.get("/")
+    assert answer.status_code == 307
+    assert answer.headers["location"] == "/docs"
