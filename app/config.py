@@ -109,6 +109,7 @@ class Settings(BaseSettings):
     )
     max_files: int = Field(default=_DEFAULTS.files, ge=1, description="Most files in one upload or archive.")
     max_pixels: int = Field(default=_DEFAULTS.pixels, ge=1, description="Most pixels or cells of one picture or grid.")
+    max_voxels: int = Field(default=_DEFAULTS.voxels, ge=1, description="Most nodes of one octree.")
     max_features: int = Field(
         default=_DEFAULTS.features, ge=1, description="Most nodes, edges and objects of one file."
     )

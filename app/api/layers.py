@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from starlette.responses import Response
 
-from app import formats
 from app.api.access import Viewer
 from app.api.answers import Route, answer, json_bytes
 from app.api.caching import none_match
@@ -27,14 +26,14 @@ from app.api.problems import NotAcceptable
 from app.api.schemas import EnvironmentPath, LayerOut, LayerPath, VersionPath, told
 from app.api.services import Here, Services
 from app.errors import Ambiguous, Invalid, MissingDatum, NotFound, Problem
-from app.formats import WriteContext
 from app.model.features import Features
 from app.model.frame import GROUND, MAX_METRES, Anchor
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
 from app.model.imagery import Picture
-from app.model.layers import MAP, SITE, VECTOR_LAYERS, Layer, Layers, PartKey
-from app.model.voxels import DEPTH, VoxelMap
+from app.model.layers import MAP, SITE, VECTOR_LAYERS, Layer, PartKey
+from app.model.voxels import DEPTH, Box3, VoxelMap
+from app.model.voxels import cut as cut_voxels
 from app.store.values import Box, PartEntry, Version
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}/layers", tags=["layers"], route_class=Route)
@@ -108,8 +107,8 @@ def get_layer(
 ) -> Response:
     """Vector layers are GeoJSON; in the local frame they are JSON-FG, with metres under `place`, never as lon/lat.
 
-    `occupancy` and `imagery` are PNG, or JSON with `Accept: application/json`; `voxels` are JSON, or the `.bt` with
-    `Accept: application/octet-stream`.
+    `occupancy` and `imagery` are PNG, or JSON with `Accept: application/json`; `voxels` are JSON (`counts` in
+    smallest voxels, however leaves were merged), or the `.bt` with `Accept: application/octet-stream`.
     """
     version = here.store.version(env, number_of(v))
     accept = request.headers.get("accept", "*/*")
@@ -130,15 +129,17 @@ def get_layer(
         if crs == "wgs84" and version.datum is None:
             raise _no_datum(env)
         key = _one(version, layer, level, name)
-        part = here.store.load(version, [key]).parts[key]
-        if isinstance(part, OccupancyGrid):
+        if layer == "voxels":
+            response = _voxels(here, version, key, _local_box(version, bbox, crs), accept)
+        elif layer == "occupancy":
             box = _local_box(version, bbox, crs)
+            part = here.store.load(version, [key]).parts[key]
+            assert isinstance(part, OccupancyGrid)
             response = _grid(key, part, box, accept)
         elif bbox is not None:
             raise Invalid(f"{layer} cannot be cut to a bbox", [Problem("not for this layer", where="bbox")])
-        elif isinstance(part, VoxelMap):
-            response = _voxels(key, part, version, accept)
         else:
+            part = here.store.load(version, [key]).parts[key]
             assert isinstance(part, Picture)
             response = _picture(key, part, accept)
     for header, value in headers.items():
@@ -295,47 +296,37 @@ def png(pixels: NDArray[Any]) -> bytes:
     return out.getvalue()
 
 
-def _voxels(key: PartKey, voxels: VoxelMap, version: Version, accept: str) -> Response:
+def _voxels(here: Services, version: Version, key: PartKey, box: Box | None, accept: str) -> Response:
+    """What a voxel map holds, or its ``.bt``; a box cuts columns of full height."""
     kind = _choose(accept, "application/json", "application/octet-stream")
+    column: Box3 | None = None
+    if box is not None:
+        x0, y0, x1, y1 = box
+        column = (x0, y0, -MAX_METRES, x1, y1, MAX_METRES)
     if kind == "application/octet-stream":
-        known = formats.all_formats().get("octomap")
-        if known is None or known.write is None:
-            raise NotAcceptable("this server cannot write OctoMap files yet: ask for application/json")
-        layers = Layers({key: voxels}, version.datum, version.levels)
-        files = formats.write(known, layers, WriteContext())
-        return Response(next(iter(files.values())), media_type=kind)
-    occupied = int((voxels.log_odds >= 0).sum())
+        wanted = {"kind": "bt", "name": key.name, "level": key.level}
+        if column is not None:
+            wanted["bbox"] = ",".join(map(repr, column))
+        made = here.maps.make(here.maps.recipe(version, "octomap", wanted))
+        return Response(made.whole().path.read_bytes(), media_type=kind)
+    part = here.store.load(version, [key]).parts[key]
+    assert isinstance(part, VoxelMap)
+    if column is not None:
+        part = cut_voxels(part, column)
+        if not len(part):
+            raise NotFound("the bbox lies outside of the voxel map")
+    bounds = part.bounds()
     return answer(
         {
             "name": key.name,
             "level": key.level,
-            "resolution": voxels.resolution,
+            "resolution": part.resolution,
             "depth": DEPTH,
-            "counts": {"occupied": occupied, "free": len(voxels.depth) - occupied},
-            "bounds": voxel_bounds(voxels),
+            "counts": part.voxel_counts(),
+            "leaves": part.leaf_counts(),
+            "bounds": list(bounds) if bounds else None,
         }
     )
-
-
-def voxel_bounds(voxels: VoxelMap) -> list[float] | None:
-    """[min x, min y, min z, max x, max y, max z] in metres around all leaves."""
-    if not len(voxels.depth):
-        return None
-    size = np.left_shift(np.int64(1), (DEPTH - voxels.depth).astype(np.int64))
-    low, high = [], []
-    for axis in range(3):
-        start = _even_bits(voxels.code >> np.uint64(axis)).astype(np.int64) * size - 2 ** (DEPTH - 1)
-        low.append(float(start.min()) * voxels.resolution)
-        high.append(float((start + size).max()) * voxels.resolution)
-    return [*low, *high]
-
-
-def _even_bits(code: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Every third bit, from the lowest, moved together: one axis of a 3-D Morton code of up to 16 bits an axis."""
-    out = np.zeros_like(code)
-    for bit in range(DEPTH):
-        out |= ((code >> np.uint64(3 * bit)) & np.uint64(1)) << np.uint64(bit)
-    return out
 
 
 def _picture(key: PartKey, picture: Picture, accept: str) -> Response:

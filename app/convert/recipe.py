@@ -48,7 +48,7 @@ class Stock:
 
     def seen_by(self, known: Format) -> Stock:
         """The same with the blank parts that came from this format."""
-        own = {k for k in self.blank if k.name == known.family}
+        own = {k for k in self.blank if k.name == known.family or (k.layer == "voxels" and k.layer in known.carries)}
         return replace(self, keys=self.keys | own, blank=frozenset()) if own else self
 
     @property

@@ -40,6 +40,7 @@ class Limits:
     unpacked_bytes: int = 1024 * 2**20
     files: int = 10_000
     pixels: int = 2**28
+    voxels: int = 2**25
     features: int = 5_000_000
     yaml_depth: int = 48
     yaml_nodes: int = 20_000_000

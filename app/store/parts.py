@@ -5,12 +5,14 @@ from __future__ import annotations
 import gc
 import hashlib
 import math
+import struct
 import threading
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, NamedTuple
+from operator import itemgetter
+from typing import Any, Final, Literal, NamedTuple, overload
 
 import numpy as np
 import ormsgpack
@@ -23,7 +25,7 @@ from app.model.geodesy import LocalFrame, crs_bounds
 from app.model.grid import OccupancyGrid
 from app.model.imagery import Picture
 from app.model.layers import Part, Resources
-from app.model.voxels import DEPTH, VoxelMap
+from app.model.voxels import VoxelMap
 from app.store import tree
 from app.store.encode import (
     ENCODING,
@@ -52,6 +54,9 @@ BATCH: Final = 512
 """Leaves that are read at once when a whole part is loaded: enough for few queries, and bounded memory."""
 
 TILE_BATCH: Final = 128
+
+VOXEL_KEY: Final = 9
+"""Bytes of a voxel's key: its place, its depth."""
 
 _FEATURES_HEAD: Final = array_header(8) + pack(ENCODING) + pack("features") + b"\xc4\x04"
 """A leaf of vector items up to its tail's four bytes."""
@@ -372,18 +377,12 @@ def _tile_names(draft: Draft, base: PartRoot | None) -> set[bytes]:
 
 
 def _compose_voxels(draft: Draft, part: VoxelMap) -> Made:
-    place = part.code << (np.uint64(3) * (np.uint64(DEPTH) - part.depth.astype(np.uint64)))
-    order = np.lexsort((part.depth, place))
-    place, depth, code = place[order], part.depth[order], part.code[order]
-    log_odds = (part.log_odds[order] + np.float32(0.0)).astype("<f4")
-    colour = None if part.colour is None else np.ascontiguousarray(part.colour[order])
-    if len(place) and bool(((place[1:] == place[:-1]) & (depth[1:] == depth[:-1])).any()):
-        raise Invalid("two voxels are the same one (equal depth and code)")
-    keys_flat = np.empty((len(place), 9), np.uint8)
-    keys_flat[:, :8] = place.astype(">u8").view(np.uint8).reshape(-1, 8)
-    keys_flat[:, 8] = depth
-    flat = keys_flat.tobytes()
-    keys = [flat[9 * k : 9 * k + 9] for k in range(len(place))]
+    depth, code = part.depth, part.code
+    log_odds = (part.log_odds + np.float32(0.0)).astype("<f4")
+    colour = None if part.colour is None else np.ascontiguousarray(part.colour)
+    flat = np.empty((len(code), VOXEL_KEY), np.uint8)
+    flat[:, :8] = part.place.astype(">u8").view(np.uint8).reshape(-1, 8)
+    flat[:, 8] = depth
 
     def encode(s: int, e: int) -> bytes:
         steps = np.diff(code[s:e], prepend=np.uint64(0)).astype("<u8")
@@ -396,36 +395,40 @@ def _compose_voxels(draft: Draft, part: VoxelMap) -> Made:
         "colour": part.colour is not None,
         "properties": ormsgpack.unpackb(pack_value(part.properties, "properties")),
     }
-    name = put_root(draft, "voxels", header, {"voxels": tree.build(draft, keys, 12, encode)})
-    return Made(name, len(place), {"local": _voxel_box(part), "wgs84": None})
+    leaves = tree.build(draft, _EvenKeys(flat.tobytes(), VOXEL_KEY), 12, encode)
+    name = put_root(draft, "voxels", header, {"voxels": leaves})
+    return Made(name, len(code), {"local": _voxel_box(part), "wgs84": None})
+
+
+class _EvenKeys(Sequence[bytes]):
+    """Keys of one length, cut from one text when they are asked for: millions of objects would take their time."""
+
+    def __init__(self, flat: bytes, width: int) -> None:
+        self._flat, self._width = flat, width
+
+    def __len__(self) -> int:
+        return len(self._flat) // self._width
+
+    @overload
+    def __getitem__(self, k: int) -> bytes: ...
+    @overload
+    def __getitem__(self, k: slice) -> Sequence[bytes]: ...
+    def __getitem__(self, k: int | slice) -> bytes | Sequence[bytes]:
+        if isinstance(k, slice):
+            return [self[i] for i in range(*k.indices(len(self)))]
+        i = range(len(self))[k] * self._width
+        return self._flat[i : i + self._width]
+
+    def __iter__(self) -> Iterator[bytes]:
+        return map(itemgetter(0), struct.iter_unpack(f"{self._width}s", self._flat))
 
 
 def _voxel_box(part: VoxelMap) -> Box | None:
-    if not len(part.code):
+    if not len(part):
         return None
-    up = np.uint64(DEPTH) - part.depth.astype(np.uint64)
-    edge = np.uint64(1) << up
-    box = []
-    for axis in (0, 1):
-        low = _gather3(part.code >> np.uint64(axis)) << up
-        box.append((float(low.min()) - 32768.0, float((low + edge).max()) - 32768.0))
-    (x0, x1), (y0, y1) = box
     r = float(part.resolution)
-    return (x0 * r, y0 * r, x1 * r, y1 * r)
-
-
-def _gather3(code: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Every third bit, from the lowest."""
-    out = code & np.uint64(0x1249249249249249)
-    for shift, mask in (
-        (2, 0x10C30C30C30C30C3),
-        (4, 0x100F00F00F00F00F),
-        (8, 0x1F0000FF0000FF),
-        (16, 0x1F00000000FFFF),
-        (32, 0x1FFFFF),
-    ):
-        out = (out | (out >> np.uint64(shift))) & np.uint64(mask)
-    return out
+    (x0, x1), (y0, y1) = ((float(low.min()) * r, float(high.max()) * r) for low, high in map(part.axis, (0, 1)))
+    return (x0, y0, x1, y1)
 
 
 def _compose_resources(draft: Draft, part: Resources) -> Made:

@@ -5,16 +5,16 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 from pyproj import Proj
 
-from app.api.layers import cut, geojson_of, voxel_bounds
+from app.api.layers import cut, geojson_of
 from app.errors import NotFound
 from app.model.grid import OccupancyGrid
-from app.model.voxels import VoxelMap
 from tests.api import samples
 from tests.api.conftest import Api
 
@@ -183,15 +183,69 @@ def test_cut_of_a_turned_grid() -> None:
         cut(turned, (1.0, 1.0, 2.0, 2.0))
 
 
-def test_bounds_of_voxels() -> None:
-    middle = 2**15
-    code = sum(((middle + v) >> b & 1) << (3 * b + axis) for axis, v in enumerate((1, 2, 3)) for b in range(16))
-    one = VoxelMap(0.5, np.array([16], np.uint8), np.array([code], np.uint64), np.array([1.0], np.float32))
-    assert voxel_bounds(one) == [0.5, 1.0, 1.5, 1.0, 1.5, 2.0]
-    root = VoxelMap(1.0, np.array([1], np.uint8), np.array([7], np.uint64), np.array([-1.0], np.float32))
-    assert voxel_bounds(root) == [0.0, 0.0, 0.0, 2.0**15, 2.0**15, 2.0**15]
-    none = VoxelMap(1.0, np.empty(0, np.uint8), np.empty(0, np.uint64), np.empty(0, np.float32))
-    assert voxel_bounds(none) is None
+OCTOMAP = Path(__file__).resolve().parents[1] / "samples" / "octomap"
+BYTES = {"Accept": "application/octet-stream"}
+
+
+def test_voxels(api: Api, bare: str) -> None:
+    shed = (OCTOMAP / "shed.bt").read_bytes()
+    api.upload(bare, {"shed.bt": shed})
+    url = f"environments/{bare}/versions/latest/layers/voxels"
+    told = api.get(url).json()
+    assert told.pop("leaves") == {"occupied": 908, "free": 1042}
+    assert told == {
+        "name": "shed",
+        "level": "ground",
+        "resolution": 0.25,
+        "depth": 16,
+        "counts": {"occupied": 908, "free": 2260},
+        "bounds": [-2.5, -2.0, 0.0, 3.0, 2.0, 2.25],
+    }
+    answer = api.get(url, headers=BYTES)
+    assert answer.headers["content-type"] == "application/octet-stream"
+    assert answer.content == shed
+    assert api.get(f"environments/{bare}/versions/latest/maps/octomap").content == shed
+    cut = api.get(f"{url}?bbox=-2.5,-2,-2.25,2&crs=local").json()
+    assert cut["bounds"] == [-2.5, -2.0, 0.0, -2.25, 2.0, 2.25]
+    assert cut["counts"] == {"occupied": 16 * 9, "free": 0}
+    part = api.get(f"{url}?bbox=-2.5,-2,-2.25,2&crs=local", headers=BYTES).content
+    assert part != shed
+    api.upload(bare, {"cut.bt": part})
+    assert {**api.get(f"{url}?name=cut").json(), "name": "shed"} == cut
+    api.problem("GET", f"{url}?name=cut&bbox=5,5,6,6", 404)
+    api.problem("GET", f"{url}?name=cut&bbox=5,5,6,6", 404, headers=BYTES)
+    api.problem("GET", url, 409)
+    api.problem("GET", f"{url}?name=cut", 406, headers={"Accept": "image/png"})
+
+
+def test_voxels_as_a_bt_whatever_was_uploaded(api: Api, bare: str) -> None:
+    shelf = (OCTOMAP / "shelf.ot").read_bytes()
+    api.upload(bare, {"map.ot": shelf})
+    latest = f"environments/{bare}/versions/latest"
+    assert api.get(f"{latest}/layers/voxels", headers=BYTES).content.startswith(b"# Octomap OcTree binary file")
+    whole = api.get(f"{latest}/maps/octomap")
+    assert whole.content == shelf
+    assert 'filename="map.ot"' in whole.headers["content-disposition"]
+    assert api.get(f"{latest}/maps/octomap/map.ot").content == shelf
+    binary = api.get(f"{latest}/maps/octomap/map.bt")
+    assert binary.content == api.get(f"{latest}/layers/voxels", headers=BYTES).content
+    report = api.get(f"{latest}/reports/octomap?kind=bt").json()
+    assert [d["what"] for d in report["dropped"]] == ["log-odds", "colours"]
+    api.problem("GET", f"{latest}/maps/octomap?depth=17", 422)
+    api.problem("GET", f"{latest}/maps/octomap?bbox=0,0,0,1,1", 422)
+    api.problem("GET", f"{latest}/maps/octomap/lab.bt", 404)
+
+
+def test_an_octree_without_voxels_comes_back(api: Api, bare: str) -> None:
+    head = (OCTOMAP / "shelf.ot").read_bytes().partition(b"size ")[0].replace(b"ColorOcTree", b"OcTree")
+    empty = head + b"size 0\nres 0.1\ndata\n"
+    answer = api.upload(bare, {"map.ot": empty}).json()
+    assert any("no voxels" in w["problem"] for w in answer["warnings"])
+    latest = f"environments/{bare}/versions/latest"
+    assert api.get(f"{latest}/maps/octomap").content == empty
+    told = api.get(f"{latest}/layers/voxels").json()
+    assert (told["counts"], told["bounds"]) == ({"occupied": 0, "free": 0}, None)
+    assert b"size 0" in api.get(f"{latest}/layers/voxels", headers=BYTES).content
 
 
 def test_coordinates_are_rounded() -> None:

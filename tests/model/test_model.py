@@ -26,7 +26,7 @@ from app.model.frame import MAX_METRES, Datum, Level, is_writable
 from app.model.grid import OccupancyGrid
 from app.model.imagery import Picture
 from app.model.layers import LAYERS, PART_TYPES, Layers, PartKey, Resources, is_empty, join_levels
-from app.model.voxels import VoxelMap
+from app.model.voxels import VoxelMap, gather, morton, spread
 
 NAN, INF = math.nan, math.inf
 CELLS = np.zeros((2, 3), np.uint8)
@@ -264,6 +264,11 @@ def voxels(**other: Any) -> VoxelMap:
         {"log_odds": np.array([NAN, 0], np.float32)},
         {"log_odds": np.array([INF, 0], np.float32)},
         {"log_odds": np.array([0, 0], np.float64)},
+        {"depth": np.array([1, 16], np.uint8), "code": np.array([7, 5], np.uint64)},
+        {"depth": np.array([16, 16], np.uint8), "code": np.array([5, 5], np.uint64)},
+        {"depth": np.array([15, 16], np.uint8), "code": np.array([1, 15], np.uint64)},
+        {"depth": np.array([16, 15], np.uint8), "code": np.array([8, 1], np.uint64)},
+        {"code": np.array([5, 2**63 + 7], np.uint64)},
         {"colour": np.zeros((2, 4), np.uint8)},
         {"colour": np.zeros((1, 3), np.uint8)},
         {"colour": np.zeros((2, 3), np.float32)},
@@ -272,6 +277,25 @@ def voxels(**other: Any) -> VoxelMap:
 def test_voxels_lie_in_the_tree(bad: dict[str, Any]) -> None:
     with pytest.raises((Invalid, ValueError)):
         voxels(**bad)
+
+
+def test_where_voxels_lie() -> None:
+    axes = [np.array([-32768, -1, 0, 1, 12345, 32767])] * 3
+    x, y, z = axes[0], axes[1][::-1], axes[2] * 0 + 7
+    code = morton(x, y, z)
+    order = np.argsort(code)
+    made = VoxelMap(0.5, np.full(6, 16, np.uint8), code[order], np.zeros(6, np.float32))
+    for k, axis in enumerate((x, y, z)):
+        low, end = made.axis(k)
+        assert low.tolist() == axis[order].tolist()
+        assert (end - low).tolist() == [1] * 6
+    assert made.bounds() == (-16384.0, -16384.0, 3.5, 16384.0, 16384.0, 4.0)
+    assert (spread(gather(code)) == code & np.uint64(0x249249249249)).all()
+    big = VoxelMap(1.0, np.array([1, 1], np.uint8), np.array([0, 7], np.uint64), np.array([-1.0, 0.0], np.float32))
+    assert big.bounds() == (-(2.0**15), -(2.0**15), -(2.0**15), 2.0**15, 2.0**15, 2.0**15)
+    assert big.voxel_counts() == {"occupied": 2**45, "free": 2**45}
+    assert big.leaf_counts() == {"occupied": 1, "free": 1}
+    assert big.place.tolist() == [0, 7 * 8**15]
 
 
 def test_voxels_cannot_be_changed() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import random
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +18,7 @@ from app.errors import Conflict, Invalid, NotFound, Problem, StaleParent, Unavai
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, Part, PartKey, Resources
+from app.model.voxels import VoxelMap
 from app.store import Store
 from app.store.changes import Changes, Delete, Drop, Put, Replace
 from app.store.values import Idempotency, Provenance, Source
@@ -403,6 +405,33 @@ def test_other_layers_tell_counts(farm: Store):
     for dtype in (np.uint16, np.float32, bool):
         again = save(farm, "farm", Replace(photo, picture(dtype=dtype)))
         assert_same_part(farm.load(again, [photo]).parts[photo], picture(dtype=dtype))
+
+
+def test_voxels_tell_which_came_changed_and_went(farm: Store):
+    key = PartKey("voxels", "ground", "v")
+    whole = voxels(30_000)
+    assert whole.colour is not None
+    a = save(farm, "farm", Replace(key, whole))
+    assert a.changes["voxels"] == {"v": {"added": len(whole), "changed": 0, "deleted": 0}}
+    odds, colour = whole.log_odds.copy(), whole.colour.copy()
+    odds[[5, 20_000]] += 0.5
+    colour[[5, 7]] ^= 1
+    depth, code = whole.depth.copy(), whole.code.copy()
+    depth[100], code[100] = 15, code[100] >> np.uint64(3)  # a larger leaf in the place of one
+    kept = np.arange(len(whole)) >= 3
+    kept[101:110] = whole.code[101:110] >> np.uint64(3) != code[100]
+    columns = (c[kept] for c in (depth, code, odds, colour))
+    names = ("depth", "code", "log_odds", "colour")
+    other = dataclasses.replace(whole, **dict(zip(names, columns, strict=True)))
+    b = save(farm, "farm", Replace(key, other))
+    gone = int((~kept).sum())
+    assert b.changes["voxels"] == {"v": {"added": 1, "changed": 3, "deleted": gone + 1}}
+    assert_same_part(farm.load(b, [key]).parts[key], other)
+    plain = save(farm, "farm", Replace(key, dataclasses.replace(other, colour=None)))
+    assert plain.changes["voxels"]["v"] == {"added": 0, "changed": len(other), "deleted": 0, "fields": ["colour"]}
+    empty = VoxelMap(0.05, np.empty(0, np.uint8), np.empty(0, np.uint64), np.empty(0, np.float32))
+    none = save(farm, "farm", Replace(key, empty))
+    assert none.changes["voxels"]["v"]["deleted"] == len(other)
 
 
 def test_a_delta_turns_one_version_into_the_other(farm: Store):

@@ -1,0 +1,561 @@
+"""OctoMap files: an octree of log-odds (``.ot``) or of free and occupied alone (``.bt``).
+
+A text header (``# Octomap OcTree file`` or ``# Octomap OcTree binary file``, comments, ``id``, ``size`` = nodes,
+``res`` = metres, ``data``), then the tree depth first, children in ascending order, x in the lowest bit of an octant.
+``.bt``: inner nodes only, two bits a child (1 free, 2 occupied, 3 inner, 0 unknown), octant 0 in the lowest, 16 bits
+little endian. ``.ot``: every node, float32 log-odds little endian, for a ColorOcTree then red, green, blue, then a byte
+with a bit for each child. Files of 2010 have a binary header: uint32 3, float64 resolution, uint32 nodes, and then the
+``.bt`` stream. Source: octomap's AbstractOcTree::write, AbstractOccupancyOcTree::readBinary,
+OccupancyOcTreeBase::writeBinaryNode.
+
+Inner nodes are not information: they are made from the leaves again (highest log-odds, mean colour), as
+``updateInnerOccupancy`` does. What is written is byte for byte what the C++ library writes for the same tree.
+
+Frame: local; the tree is centred on the origin.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import Ambiguous, MissingLayer, NotFound, Problem, TooLarge, UnreadableFile
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, register
+from app.model.frame import GROUND, is_writable
+from app.model.layers import MAP, Layers, PartKey
+from app.model.voxels import DEPTH, UNSET, VoxelMap, coarser, cut, parents_of, pruned
+from app.parameters import parameter
+
+NAME = "octomap"
+TEXT = b"# Octomap OcTree"
+BINARY_FILE = b"# Octomap OcTree binary file"
+FULL_FILE = b"# Octomap OcTree file"
+COMMENTS = ("# (feel free to add / change comments, but leave the first line as it is!)", "#")
+LEGACY = struct.Struct("<IdI")
+LEGACY_TYPE = 3
+
+OCTREE = "OcTree"
+COLOR_OCTREE = "ColorOcTree"
+FULL_TYPES = (OCTREE, COLOR_OCTREE, "OcTreeStamped")
+"""Trees whose ``.ot`` is read: OcTreeStamped keeps its times to itself and is stored like an OcTree."""
+
+LOG_ODDS = (np.float32(math.log(0.1192 / (1 - 0.1192))), np.float32(math.log(0.971 / (1 - 0.971))))
+"""What free and occupied become where only they are known: the library's clamping thresholds."""
+
+HEADER_BYTES = 2**16
+WAITING = 7 * DEPTH
+"""Nodes of a tree of this depth that can wait for their turn in a depth-first walk."""
+
+Kind = Literal["bt", "ot"]
+Words = NDArray[np.uint16]
+Masks = NDArray[np.uint8]
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """Which voxels, and how they are written."""
+
+    name: str | None = parameter(None, "name of the voxel map; default: map, else the only one")
+    level: str | None = parameter(None, "level of the voxel map; default: the one it is on")
+    kind: Literal["bt", "ot"] | None = parameter(
+        None, "bt: free and occupied only; ot: log-odds and colours; default: as uploaded"
+    )
+    depth: int | None = parameter(
+        None,
+        f"level of detail: merge what is below this depth ({DEPTH}: smallest voxels, each level above doubles their "
+        "edge) into the most occupied of it",
+        minimum=1,
+        maximum=DEPTH,
+    )
+    bbox: tuple[float, float, float, float, float, float] | None = parameter(
+        None, "cut to the voxels that meet this box: min x,min y,min z,max x,max y,max z in the local frame", unit="m"
+    )
+    prune: bool | None = parameter(
+        None, "merge eight equal leaves into one; default: as OctoMap does when it writes, bt yes, ot no"
+    )
+
+
+# --- telling ------------------------------------------------------------------------------------------------------
+def detect(name: str, data: bytes) -> bool:
+    """The first line, or the binary header of 2010 with possible numbers."""
+    del name
+    if data.startswith(TEXT):
+        return data.startswith((BINARY_FILE, FULL_FILE))
+    if len(data) < LEGACY.size or data[:4] != b"\x03\0\0\0":
+        return False
+    _, resolution, size = LEGACY.unpack_from(data)
+    inner = (len(data) - LEGACY.size) // 2
+    return bool(1e-6 <= resolution <= 1e4) and inner <= size <= 1 + 8 * inner
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    """What stands before the tree. body: offset of the tree's first byte."""
+
+    kind: Kind
+    id: str
+    size: int
+    resolution: float
+    comments: tuple[str, ...]
+    body: int
+
+
+def _wrong(reason: str, line: int | None = None, where: str | None = None) -> UnreadableFile:
+    return UnreadableFile(reason, [Problem(reason, line=line, where=where)])
+
+
+def _header(data: bytes, context: ReadContext) -> _Header:
+    if not data.startswith(TEXT):
+        return _legacy_header(data, context)
+    kind: Kind = "bt" if data.startswith(BINARY_FILE) else "ot"
+    if kind == "ot" and not data.startswith(FULL_FILE):
+        raise _wrong(f"the first line must be {FULL_FILE.decode()!r} or {BINARY_FILE.decode()!r}", 1)
+    said: dict[str, tuple[str, int]] = {}
+    comments: list[str] = []
+    position, number = data.find(b"\n") + 1, 1
+    while True:
+        end = data.find(b"\n", position, HEADER_BYTES)
+        if position == 0 or end < 0:
+            raise _wrong("the header does not end: the line 'data' is missing", number, "data")
+        number += 1
+        line, position = data[position:end].rstrip(b"\r"), end + 1
+        tokens = line.split()
+        while tokens:
+            token = tokens.pop(0)
+            if token == b"data":
+                return _stated(kind, said, tuple(comments), position, context)
+            if token.startswith(b"#"):
+                comments.append(_decoded(line[line.index(b"#") :]))
+                break
+            word = _decoded(token)
+            if word not in ("id", "res", "size") or not tokens:
+                context.warn(f"unknown word {word[:40]!r} in the header: left out", line=number, where=word[:40])
+                break
+            said[word] = (_decoded(tokens.pop(0)), number)
+
+
+def _decoded(text: bytes) -> str:
+    try:
+        return text.decode()
+    except UnicodeDecodeError:
+        return text.decode("latin-1")
+
+
+def _stated(
+    kind: Kind, said: Mapping[str, tuple[str, int]], comments: tuple[str, ...], body: int, context: ReadContext
+) -> _Header:
+    for word in ("id", "size", "res"):
+        if word not in said:
+            raise _wrong(f"the header does not tell the tree's {word}", where=word)
+    name, line = said["id"]
+    if name == "1":
+        context.warn("the id 1 is an old one: taken for OcTree", line=line, where="id")
+        name = OCTREE
+    if kind == "ot" and name not in FULL_TYPES:
+        reason = f"an .ot of the type {name[:80]!r} cannot be read, only {', '.join(FULL_TYPES)}: save it as a .bt"
+        raise _wrong(reason, line, "id")
+    if not re.fullmatch(r"\w{1,80}", name, re.ASCII):
+        raise _wrong(f"the tree's type must be a word, got {name[:80]!r}", line, "id")
+    size, line = said["size"]
+    if not re.fullmatch(r"\d{1,12}", size, re.ASCII):
+        raise _wrong(f"size must be the number of nodes, got {size[:40]!r}", line, "size")
+    resolution, line = said["res"]
+    if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", resolution, re.ASCII):
+        raise _wrong(f"res must be a number of metres, got {resolution[:40]!r}", line, "res")
+    _check_resolution(float(resolution), line)
+    usual = comments == COMMENTS
+    kept = () if usual else tuple(c for c in comments if is_writable(c.replace("\t", " ")))
+    if len(kept) < len(comments) and not usual:
+        context.warn("comments with control characters are left out")
+    return _Header(kind, name, int(size), float(resolution), kept, body)
+
+
+def _check_resolution(resolution: float, line: int | None = None) -> None:
+    if not 1e-6 <= resolution <= 1e4:
+        raise _wrong(f"the resolution must be between 1e-6 and 1e4 metres, got {resolution!r}", line, "res")
+
+
+def _legacy_header(data: bytes, context: ReadContext) -> _Header:
+    if len(data) < LEGACY.size or data[:4] != b"\x03\0\0\0":
+        raise _wrong(f"the first line must be {FULL_FILE.decode()!r} or {BINARY_FILE.decode()!r}", 1)
+    _, resolution, size = LEGACY.unpack_from(data)
+    _check_resolution(resolution)
+    context.warn("an OctoMap file of 2010 without a text header: served with today's")
+    return _Header("bt", OCTREE, size, resolution, (), LEGACY.size)
+
+
+# --- reading ------------------------------------------------------------------------------------------------------
+def read(files: Files, context: ReadContext) -> Layers:
+    """One voxel map. Raises UnreadableFile (with line and word of the header, or the reason) or TooLarge."""
+    main = context.main or next(iter(files))
+    data = files[main]
+    header = _header(data, context)
+    if not context.wants("voxels"):
+        return Layers()
+    if header.size > context.limits.voxels:
+        raise TooLarge(f"the tree has {header.size} nodes; the limit is {context.limits.voxels}")
+    colour: NDArray[np.uint8] | None = None
+    if header.size == 0 and len(data) == header.body:
+        depth, code, odds = np.empty(0, np.uint8), np.empty(0, np.uint64), np.empty(0, np.float32)
+        colour = np.empty((0, 3), np.uint8) if header.id == COLOR_OCTREE and header.kind == "ot" else None
+    elif header.kind == "bt":
+        depth, code, odds = _read_binary(data, header)
+    else:
+        depth, code, odds, colour = _read_full(data, header)
+    if not len(depth):
+        context.warn("the tree holds no voxels")
+    own: dict[str, Any] = {}
+    if header.id != (COLOR_OCTREE if colour is not None else OCTREE):
+        own["id"] = header.id
+    if header.comments:
+        own["comments"] = list(header.comments)
+    properties = {NAME: own} if own else {}
+    voxels = VoxelMap(header.resolution, depth, code, odds, colour, header.kind == "bt", properties)
+    name = context.grid or main.rpartition("/")[2].rpartition(".")[0] or MAP
+    return Layers({PartKey("voxels", context.level, name): voxels})
+
+
+def _read_binary(data: bytes, header: _Header) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32]]:
+    """Depth, code and log-odds of the leaves of a stream of inner nodes."""
+    rest = len(data) - header.body
+    if rest % 2:
+        raise _wrong(f"the tree has {rest} bytes, which is no whole number of 16 bit words", where="data")
+    if rest // 2 > header.size:
+        raise _wrong(f"the header says {header.size} nodes, the data has {rest // 2} inner nodes alone", where="size")
+    words: Words = np.frombuffer(data, "<u2", rest // 2, header.body).astype(np.uint16, copy=False)
+    inner = _packed(words & (words >> np.uint16(1)))
+    leaves = _packed(words ^ (words >> np.uint16(1)))
+    count = int(np.bitwise_count(leaves).sum(dtype=np.int64))
+    _check_size(len(words) + count, header)
+    occupied = _packed((words & ~(words << np.uint16(1))) >> np.uint16(1))
+    at_depth = _by_depth(inner, DEPTH - 1)
+    if len(words) > 1 and bool((words == 0).any()):
+        raise _wrong("an inner node has no children", where="data")
+    codes, depths, states = [], [], []
+    code = np.zeros(1, np.uint64)
+    for depth, rows in enumerate(at_depth):
+        node, octant = _children(leaves[rows])
+        codes.append(code[node] << np.uint64(3) | octant)
+        depths.append(np.full(len(node), depth + 1, np.uint8))
+        states.append(occupied[rows][node] >> octant.astype(np.uint8) & np.uint8(1))
+        node, octant = _children(inner[rows])
+        code = code[node] << np.uint64(3) | octant
+    code, depth_, state = np.concatenate(codes), np.concatenate(depths), np.concatenate(states)
+    up = np.multiply(np.uint8(DEPTH) - depth_, np.uint8(3), dtype=np.uint64)
+    order = np.argsort(code << up)
+    return depth_[order], code[order], np.array(LOG_ODDS)[state[order]]
+
+
+def _packed(pairs: Words) -> Masks:
+    """The even ones of 16 bits, moved together: uint8 [n]."""
+    x = pairs & np.uint16(0x5555)
+    x = (x | x >> np.uint16(1)) & np.uint16(0x3333)
+    x = (x | x >> np.uint16(2)) & np.uint16(0x0F0F)
+    return (x | x >> np.uint16(4)).astype(np.uint8)
+
+
+def _read_full(
+    data: bytes, header: _Header
+) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32], NDArray[np.uint8] | None]:
+    """Depth, code, log-odds and colour of the leaves of a stream of all nodes."""
+    record = _record(header.id)
+    rest = len(data) - header.body
+    if rest % record.itemsize:
+        size = record.itemsize
+        raise _wrong(f"the tree has {rest} bytes; a node of {header.id} takes {size}, which does not go", where="data")
+    nodes = np.frombuffer(data, record, rest // record.itemsize, header.body)
+    _check_size(len(nodes), header)
+    masks: Masks = np.ascontiguousarray(nodes["mask"])
+    at_depth = _by_depth(masks, DEPTH)
+    leaf = masks == 0
+    code, depth = np.empty(len(nodes), np.uint64), np.empty(len(nodes), np.uint8)
+    codes = np.zeros(1, np.uint64)
+    for d, rows in enumerate(at_depth):
+        code[rows] = codes
+        depth[rows] = d
+        node, octant = _children(masks[rows])
+        codes = codes[node] << np.uint64(3) | octant
+    odds = nodes["odds"][leaf].astype(np.float32) + np.float32(0.0)
+    if not bool(np.isfinite(odds).all()):
+        at = int(np.flatnonzero(leaf)[np.flatnonzero(~np.isfinite(odds))[0]])
+        raise _wrong(f"the log-odds of node {at} are no finite number", where="data")
+    colour = np.ascontiguousarray(nodes["colour"][leaf]) if header.id == COLOR_OCTREE else None
+    if len(nodes) == 1:  # the whole tree is one leaf: its eight octants
+        colour = None if colour is None else np.repeat(colour, 8, axis=0)
+        return np.ones(8, np.uint8), np.arange(8, dtype=np.uint64), np.repeat(odds, 8), colour
+    return depth[leaf], code[leaf], odds, colour
+
+
+def _record(tree: str) -> np.dtype[Any]:
+    """A node of an ``.ot``."""
+    colour = [("colour", "u1", 3)] if tree == COLOR_OCTREE else []
+    return np.dtype([("odds", "<f4"), *colour, ("mask", "u1")])
+
+
+def _check_size(counted: int, header: _Header) -> None:
+    if counted != header.size:
+        raise _wrong(f"the header says {header.size} nodes, the data has {counted}", where="size")
+
+
+def _children(masks: Masks) -> tuple[Rows, NDArray[np.uint64]]:
+    """Row and octant of each set bit, in ascending order."""
+    bits = np.flatnonzero(np.unpackbits(masks, bitorder="little"))
+    return bits >> 3, (bits & 7).astype(np.uint64)
+
+
+def _by_depth(masks: Masks, deepest: int) -> list[Rows]:
+    """The nodes of a depth-first stream by depth: indexes, ascending, so the children of one depth in their order.
+
+    masks: uint8 [n], a bit for each child that follows in the stream. Before node k, P[k] + 1 nodes wait for their turn
+    (itself included): P[0] = 0, P[k + 1] = P[k] + children - 1. The subtree of k ends where P falls below P[k] for the
+    first time, and since P falls by one at most that is where it is P[k] - 1. The depth of a node is the number of
+    subtrees that have begun before it and not ended. No recursion, whatever the bytes say.
+    """
+    n = len(masks)
+    children = np.bitwise_count(masks)
+    waiting = np.cumsum(children, dtype=np.int64)
+    waiting -= np.arange(1, n + 1)
+    short = waiting < 0
+    if not bool(short.any()):
+        raise _wrong("the data ends before the tree does", where="data")
+    end = int(np.argmax(short))
+    if end != n - 1:
+        raise _wrong(f"the tree ends after {end + 1} nodes, but the data goes on", where="data")
+    if n > 1 and int(waiting.max()) > WAITING:
+        raise _wrong(f"the tree is deeper than {DEPTH} levels", where="data")
+    before = np.zeros(n, np.int8)
+    before[1:] = waiting[:-1]
+    order = np.argsort(before, kind="stable")
+    group = np.searchsorted(before[order], np.arange(int(before.max()) + 2))
+    step = np.zeros(n + 1, np.int64)
+    step[np.flatnonzero(children) + 1] = 1
+    ends = []
+    for value in range(1, len(group) - 1):
+        these, lower = order[group[value] : group[value + 1]], order[group[value - 1] : group[value]]
+        begun = these[children[these] > 0]
+        ends.append(lower[np.searchsorted(lower, begun)])
+    if ends:
+        step -= np.bincount(np.concatenate(ends), minlength=n + 1)
+    depth = np.cumsum(step[:n])
+    if int(depth.max()) > deepest:
+        raise _wrong(f"the tree is deeper than {DEPTH} levels", where="data")
+    order = np.argsort(depth.astype(np.int8), kind="stable")
+    return np.split(order, np.cumsum(np.bincount(depth))[:-1])
+
+
+# --- writing ------------------------------------------------------------------------------------------------------
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``map.bt`` or ``map.ot`` (``<name>.bt`` where a name is asked for).
+
+    Raises MissingLayer, NotFound, Ambiguous, or Invalid for an impossible box.
+    """
+    options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
+    key = choose(sorted(layers.of("voxels")), options)[0]
+    voxels = layers.parts[key]
+    if not isinstance(voxels, VoxelMap):
+        raise AssertionError(f"{key} is no voxel map")
+    kind: Kind = options.kind or ("bt" if voxels.binary else "ot")
+    if options.bbox is not None:
+        before = len(voxels)
+        voxels = cut(voxels, options.bbox)
+        if before and not len(voxels):
+            raise NotFound("the bbox lies outside of the voxel map")
+    if options.depth is not None:
+        merged = coarser(voxels, options.depth)
+        context.drop("voxels", len(voxels) - len(merged), f"merged at depth={options.depth}")
+        voxels = merged
+    tree = _tree_type(voxels)
+    if kind == "bt":
+        voxels = _likeliest(voxels, context)
+    if kind == "bt" if options.prune is None else options.prune:
+        voxels = _pruned(voxels, options.depth or DEPTH, kind, context)
+    if kind == "ot" and tree not in FULL_TYPES:
+        context.warn(f"a tree of the type {tree} is served as an {OCTREE}")
+        tree = OCTREE
+    size, body = _binary(voxels) if kind == "bt" else _full(voxels, tree == COLOR_OCTREE)
+    stem = re.sub(r"[/\\\x00-\x1f]", "_", options.name or MAP).lstrip(".") or MAP
+    return {f"{stem}.{kind}": _head(kind, tree, size, voxels) + body}
+
+
+def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
+    """The named voxel map; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
+    every = [key for key in keys if key.layer == "voxels"]
+    if not every:
+        raise MissingLayer("there is no voxel map: upload one (an OctoMap file)")
+    found = [key for key in every if options.level in (None, key.level)]
+    names = sorted({key.name for key in found})
+    if not found:
+        levels = ", ".join(sorted({key.level for key in every}))
+        raise NotFound(f"there is no voxel map on the level {options.level!r}; there are some on: {levels}")
+    name = options.name or (MAP if MAP in names else names[0] if len(names) == 1 else None)
+    if name is None:
+        raise Ambiguous(f"there are several voxel maps, name one with name=…: {', '.join(names)}")
+    found = [key for key in found if key.name == name]
+    if not found:
+        raise NotFound(f"there is no voxel map {name!r}; there are: {', '.join(names)}")
+    if len(found) > 1:
+        ground = [key for key in found if key.level == GROUND]
+        if not ground:
+            levels = ", ".join(key.level for key in found)
+            raise Ambiguous(f"the voxel map {name!r} is there on several levels, name one with level=…: {levels}")
+        found = ground
+    return found
+
+
+def by_file(name: str) -> dict[str, str]:
+    """``map.ot`` asks for the full tree; ``lab.bt`` for the voxel map ``lab``, too."""
+    stem, _, end = name.rpartition(".")
+    if not stem or end not in ("bt", "ot"):
+        return {}
+    return {"kind": end, **({} if stem == MAP else {"name": stem})}
+
+
+def _tree_type(voxels: VoxelMap) -> str:
+    said = voxels.properties.get(NAME)
+    name = said.get("id") if isinstance(said, Mapping) else None
+    return name if isinstance(name, str) else OCTREE if voxels.colour is None else COLOR_OCTREE
+
+
+def _likeliest(voxels: VoxelMap, context: WriteContext) -> VoxelMap:
+    """Free and occupied only, as OctoMap's toMaxLikelihood makes them."""
+    odds = np.array(LOG_ODDS)[voxels.occupied.astype(np.intp)]
+    if not voxels.binary:
+        finer = int(np.count_nonzero(odds != voxels.log_odds))
+        context.drop("log-odds", finer, "a .bt keeps free and occupied only: ask for kind=ot")
+    if voxels.colour is not None:
+        set_ = int(np.count_nonzero((voxels.colour != UNSET).any(axis=1)))
+        context.drop("colours", set_, "a .bt keeps free and occupied only: ask for kind=ot")
+    return VoxelMap(voxels.resolution, voxels.depth, voxels.code, odds, None, True, voxels.properties)
+
+
+def _pruned(voxels: VoxelMap, deepest: int, kind: Kind, context: WriteContext) -> VoxelMap:
+    out = pruned(voxels, deepest)
+    if kind == "ot" and voxels.colour is not None and out.colour is not None and len(out) < len(voxels):
+        holder = np.searchsorted(out.place, voxels.place, side="right") - 1
+        other = int(np.count_nonzero((voxels.colour != out.colour[holder]).any(axis=1)))
+        context.drop("colours", other, "pruning averages the colours of equal voxels")
+    return out
+
+
+def _head(kind: Kind, tree: str, size: int, voxels: VoxelMap) -> bytes:
+    """The header, as the library prints it: six digits of the resolution, unless it has more."""
+    said = voxels.properties.get(NAME)
+    comments = said.get("comments") if isinstance(said, Mapping) else None
+    shown = f"{voxels.resolution:g}"
+    lines = [
+        (BINARY_FILE if kind == "bt" else FULL_FILE).decode(),
+        *(comments if isinstance(comments, (list, tuple)) else COMMENTS),
+        f"id {tree}",
+        f"size {size}",
+        f"res {shown if float(shown) == voxels.resolution else repr(voxels.resolution)}",
+        "data",
+    ]
+    return ("\n".join(map(str, lines)) + "\n").encode()
+
+
+def _binary(voxels: VoxelMap) -> tuple[int, bytes]:
+    """Number of nodes, and the stream of inner nodes."""
+    if not len(voxels):
+        return 0, b""
+    state = np.where(voxels.occupied, np.uint16(2), np.uint16(1))
+    keys, words = [], []
+    code, bits = np.empty(0, np.uint64), np.empty(0, np.uint16)
+    for depth in range(DEPTH, 0, -1):
+        here = np.flatnonzero(voxels.depth == depth)
+        code = np.concatenate([voxels.code[here], code])
+        bits = np.concatenate([state[here], bits])
+        if not len(code):
+            continue
+        if len(here) not in (0, len(code)):
+            order = np.argsort(code, kind="stable")  # two ascending runs
+            code, bits = code[order], bits[order]
+        octant = (code & np.uint64(7)).astype(np.uint16)
+        above = code >> np.uint64(3)
+        start = np.flatnonzero(np.concatenate([[True], above[1:] != above[:-1]]))
+        code = above[start]
+        words.append(np.bitwise_or.reduceat(bits << (octant + octant), start))
+        keys.append(_key(code, depth - 1))
+        bits = np.full(len(code), 3, np.uint16)
+    order = np.argsort(np.concatenate(keys))
+    stream = np.concatenate(words)[order]
+    return len(voxels) + len(stream), stream.astype("<u2", copy=False).tobytes()
+
+
+def _full(voxels: VoxelMap, coloured: bool) -> tuple[int, bytes]:
+    """Number of nodes, and the stream of all nodes. A tree with colours of a map without has all of them unset."""
+    if not len(voxels):
+        return 0, b""
+    colours = voxels.colour if coloured else None
+    keys, masks, odds_of, colour_of = [], [], [], []
+    code, odds = np.empty(0, np.uint64), np.empty(0, np.float32)
+    colour = None if colours is None else np.empty((0, 3), np.uint8)
+    for depth in range(DEPTH, 0, -1):
+        here = np.flatnonzero(voxels.depth == depth)
+        code = np.concatenate([voxels.code[here], code])
+        odds = np.concatenate([voxels.log_odds[here], odds])
+        if colour is not None and colours is not None:
+            colour = np.concatenate([colours[here], colour])
+        if not len(code):
+            continue
+        if len(here) not in (0, len(code)):
+            order = np.argsort(code, kind="stable")  # two ascending runs
+            code, odds = code[order], odds[order]
+            colour = None if colour is None else colour[order]
+        bit = np.left_shift(np.uint8(1), (code & np.uint64(7)).astype(np.uint8))
+        start, code, odds, colour = parents_of(code, odds, colour)
+        keys.append(_key(code, depth - 1))
+        masks.append(np.bitwise_or.reduceat(bit, start))
+        odds_of.append(odds)
+        colour_of.append(colour)
+    if voxels.binary:  # the library reads every .bt's root as occupied, and writes it so
+        odds_of[-1] = np.array([LOG_ODDS[1]])
+    key = np.concatenate(keys)
+    order = np.argsort(key)
+    n = len(voxels) + len(key)
+    # An inner node stands right before the first leaf in it, after its own ancestors, which have smaller keys.
+    at = np.searchsorted(_key(voxels.code, voxels.depth), key[order]) + np.arange(len(key))
+    inner = np.zeros(n, bool)
+    inner[at] = True
+    nodes = np.zeros(n, _record(COLOR_OCTREE if coloured else OCTREE))
+    nodes["odds"][inner] = np.concatenate(odds_of)[order]
+    nodes["odds"][~inner] = voxels.log_odds
+    nodes["mask"][inner] = np.concatenate(masks)[order]
+    if coloured:
+        given = [c for c in colour_of if c is not None]
+        nodes["colour"][inner] = np.concatenate(given)[order] if given else UNSET
+        nodes["colour"][~inner] = UNSET if colours is None else colours
+    return n, nodes.tobytes()
+
+
+def _key(code: NDArray[np.uint64], depth: int | NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """What sorts nodes as a depth-first walk meets them: place, then depth."""
+    levels = np.asarray(depth, np.uint64)
+    place = code << (np.uint64(3) * (np.uint64(DEPTH) - levels))
+    return place << np.uint64(5) | levels
+
+
+register(
+    Format(
+        name=NAME,
+        title="OctoMap (.bt, .ot)",
+        files=("map.bt", "map.ot"),
+        media_types=("application/octet-stream", "application/octet-stream"),
+        carries=frozenset({"voxels"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs((frozenset({"voxels"}),)),
+        write_options=WriteOptions,
+        extensions=(".bt", ".ot"),
+        choose=choose,
+        by_file=by_file,
+    )
+)
