@@ -728,9 +728,8 @@ def sample_maps() -> list[tuple[str, dict[str, bytes]]]:
     for folder in sorted(SAMPLES.iterdir()):
         for item in sorted(folder.iterdir()):
             if item.is_dir():
-                out.append(
-                    (folder.name, {p.name: p.read_bytes() for p in sorted(item.iterdir()) if p.suffix != ".json"})
-                )
+                paths = [p for p in sorted(item.rglob("*")) if p.is_file() and not p.name.endswith("facts.json")]
+                out.append((folder.name, {p.relative_to(item).as_posix(): p.read_bytes() for p in paths}))
             elif not item.name.endswith("facts.json"):
                 out.append((folder.name, {item.name: item.read_bytes()}))
     return out
