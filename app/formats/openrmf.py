@@ -655,7 +655,7 @@ def _storeys(layers: Layers) -> list[_Storey]:
     """The levels in the order of their file; those that came from elsewhere last."""
     found: dict[str, _Storey] = {}
     own_names = {
-        (p.get("kind"), p.get("name"))
+        (str(p.get("kind")), str(p.get("name")))
         for key, part in layers.vector("objects").items()
         if key.name == NAME
         for p in part.properties
@@ -664,7 +664,7 @@ def _storeys(layers: Layers) -> list[_Storey]:
         part = objects
         if key.name == NAV_GRAPH:  # graphs repeat the doors and lifts of the building that they were made from
             part = part.take(
-                [k for k, p in enumerate(part.properties) if (p.get("kind"), p.get("name")) not in own_names]
+                [k for k, p in enumerate(part.properties) if (str(p.get("kind")), str(p.get("name"))) not in own_names]
             )
         if key.name in (NAME, NAV_GRAPH) and (len(part) or NAME in part.document):
             found.setdefault(key.level, _Storey(key.level)).objects.append(part)

@@ -449,7 +449,8 @@ class _Writer:
             edges = self._edges(networks, places)
             document = mapping(documents.get(NAME), NAME)
             scale = mapping(documents.get(BUILDING), BUILDING).get("transform")
-            factor = float(scale[0]) ** 2 if isinstance(scale, list) and scale else 1.0
+            known = isinstance(scale, list) and scale and isinstance(scale[0], (int, float))
+            factor = float(scale[0]) ** 2 if known else 1.0
             storey = _Storey(level, ids, nodes, np.concatenate(at), edges, document, PARALLEL * factor)
             storey.lifts = self._inside(storey)
             out.append(storey)
@@ -537,7 +538,8 @@ class _Writer:
 
     def _level(self, storey: _Storey, graph: int, names: Counter[str]) -> str:
         edges = storey.edges.get(graph, [])
-        listed = [(own(p, NAME).get("graphs") or {}).get(str(graph)) for p in storey.nodes]
+        graphs = [own(p, NAME).get("graphs") for p in storey.nodes]
+        listed = [said.get(str(graph)) if isinstance(said, dict) else None for said in graphs]
         order = sorted((k for k, at in enumerate(listed) if isinstance(at, int)), key=lambda k: (listed[k], k))
         order = list(dict.fromkeys([*order, *(k for e in edges for k in (e.source, e.target))]))
         place = {k: n for n, k in enumerate(order)}
@@ -676,11 +678,15 @@ def _graph_of(p: Properties) -> int | None:
     return graph if 0 <= graph < MAX_GRAPHS else None
 
 
-def _lane_of(p: Properties) -> Any:
-    """What two edges of one two-way lane have in common."""
+def _lane_of(p: Properties) -> int | None:
+    """The number of the lane in its file: what two edges of one two-way lane have in common."""
+    said = own(p, NAME) if NAME in p else own(p, BUILDING)
     if NAME in p:
-        return own(p, NAME).get("index") if own(p, NAME).get("parameters", {}).get("is_bidirectional") is True else None
-    return own(p, BUILDING).get("index")
+        parameters = said.get("parameters")
+        if not isinstance(parameters, dict) or parameters.get("is_bidirectional") is not True:
+            return None
+    index = said.get("index")
+    return index if isinstance(index, int) else None
 
 
 def _rounded(values: Array) -> Any:

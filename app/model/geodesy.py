@@ -48,8 +48,9 @@ class LocalFrame:
         if self._sin == 0.0 and self._cos == 1.0:
             out[:, 0], out[:, 1] = east, north
         else:
-            out[:, 0] = east * self._cos - north * self._sin
-            out[:, 1] = east * self._sin + north * self._cos
+            with np.errstate(invalid="ignore"):  # infinite places turn into no number, which callers refuse alike
+                out[:, 0] = east * self._cos - north * self._sin
+                out[:, 1] = east * self._sin + north * self._cos
         return out
 
     def _to_near(self, lonlat: Array) -> Array:
