@@ -449,8 +449,8 @@ class _Writer:
             edges = self._edges(networks, places)
             document = mapping(documents.get(NAME), NAME)
             scale = mapping(documents.get(BUILDING), BUILDING).get("transform")
-            known = isinstance(scale, list) and scale and isinstance(scale[0], (int, float))
-            factor = float(scale[0]) ** 2 if known else 1.0
+            said = scale[0] if isinstance(scale, list) and scale else None
+            factor = float(said) ** 2 if isinstance(said, (int, float)) else 1.0
             storey = _Storey(level, ids, nodes, np.concatenate(at), edges, document, PARALLEL * factor)
             storey.lifts = self._inside(storey)
             out.append(storey)
