@@ -20,9 +20,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import Ambiguous, BadUpload, FleetMapError, Invalid, MissingLayer, NotFound, Problem, UnreadableFile
+from app.errors import BadUpload, FleetMapError, Invalid, Problem, UnreadableFile
 from app.formats import BAD_INPUT, Files, Format, Limits, Needs, ReadContext, WriteContext, _image, _yaml, register
-from app.model.frame import GROUND, MAX_METRES
+from app.formats._choice import the_one
+from app.model.frame import MAX_METRES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, Mode, OccupancyGrid, outline
 from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
@@ -350,27 +351,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named grid; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
-    every = [key for key in keys if key.layer == "occupancy"]
-    if not every:
-        raise MissingLayer("there is no occupancy grid: upload one (a YAML and its image)")
-    found = [key for key in every if options.level in (None, key.level)]
-    names = sorted({key.name for key in found})
-    if not found:
-        levels = ", ".join(sorted({key.level for key in every}))
-        raise NotFound(f"there is no grid on the level {options.level!r}; there are grids on: {levels}")
-    name = options.grid or (MAP if MAP in names else names[0] if len(names) == 1 else None)
-    if name is None:
-        raise Ambiguous(f"there are several grids, name one with grid=…: {', '.join(names)}")
-    found = [key for key in found if key.name == name]
-    if not found:
-        raise NotFound(f"there is no grid {name!r}; there are: {', '.join(names)}")
-    if len(found) > 1:
-        ground = [key for key in found if key.level == GROUND]
-        if not ground:
-            levels = ", ".join(key.level for key in found)
-            raise Ambiguous(f"the grid {name!r} is there on several levels, name one with level=…: {levels}")
-        found = ground
-    return found
+    supply = "upload one (a YAML and its image)"
+    return the_one(keys, "occupancy", options.grid, options.level, what="grid", option="grid", supply=supply)
 
 
 def by_file(name: str) -> dict[str, str]:

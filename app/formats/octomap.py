@@ -26,9 +26,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import Ambiguous, MissingLayer, NotFound, Problem, TooLarge, UnreadableFile
+from app.errors import NotFound, Problem, TooLarge, UnreadableFile
 from app.formats import Files, Format, Needs, ReadContext, WriteContext, register
-from app.model.frame import GROUND, is_writable
+from app.formats._choice import the_one
+from app.model.frame import is_writable
 from app.model.layers import MAP, Layers, PartKey
 from app.model.voxels import DEPTH, UNSET, VoxelMap, coarser, cut, parents_of, pruned
 from app.parameters import parameter
@@ -387,27 +388,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named voxel map; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
-    every = [key for key in keys if key.layer == "voxels"]
-    if not every:
-        raise MissingLayer("there is no voxel map: upload one (an OctoMap file)")
-    found = [key for key in every if options.level in (None, key.level)]
-    names = sorted({key.name for key in found})
-    if not found:
-        levels = ", ".join(sorted({key.level for key in every}))
-        raise NotFound(f"there is no voxel map on the level {options.level!r}; there are some on: {levels}")
-    name = options.name or (MAP if MAP in names else names[0] if len(names) == 1 else None)
-    if name is None:
-        raise Ambiguous(f"there are several voxel maps, name one with name=…: {', '.join(names)}")
-    found = [key for key in found if key.name == name]
-    if not found:
-        raise NotFound(f"there is no voxel map {name!r}; there are: {', '.join(names)}")
-    if len(found) > 1:
-        ground = [key for key in found if key.level == GROUND]
-        if not ground:
-            levels = ", ".join(key.level for key in found)
-            raise Ambiguous(f"the voxel map {name!r} is there on several levels, name one with level=…: {levels}")
-        found = ground
-    return found
+    supply = "upload one (an OctoMap file)"
+    return the_one(keys, "voxels", options.name, options.level, what="voxel map", option="name", supply=supply)
 
 
 def by_file(name: str) -> dict[str, str]:

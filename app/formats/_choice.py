@@ -1,0 +1,40 @@
+"""Which of several named parts a map is made of, where a format holds one: grids, voxel maps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from app.errors import Ambiguous, MissingLayer, NotFound
+from app.model.frame import GROUND
+from app.model.layers import MAP, Layer, PartKey
+
+
+def the_one(
+    keys: Sequence[PartKey], layer: Layer, name: str | None, level: str | None, *, what: str, option: str, supply: str
+) -> list[PartKey]:
+    """The named part; else ``map``, else the only one; on its level, else on the ground, else on the only one.
+
+    what: the part as users call it (``grid``). option: the parameter that names it. supply: what to upload. Raises
+    MissingLayer, NotFound, or Ambiguous with the names to choose from.
+    """
+    every = [key for key in keys if key.layer == layer]
+    if not every:
+        raise MissingLayer(f"there is no {what}: {supply}")
+    found = [key for key in every if level in (None, key.level)]
+    names = sorted({key.name for key in found})
+    if not found:
+        levels = ", ".join(sorted({key.level for key in every}))
+        raise NotFound(f"there is no {what} on the level {level!r}; there are {what}s on: {levels}")
+    name = name or (MAP if MAP in names else names[0] if len(names) == 1 else None)
+    if name is None:
+        raise Ambiguous(f"there are several {what}s, name one with {option}=…: {', '.join(names)}")
+    found = [key for key in found if key.name == name]
+    if not found:
+        raise NotFound(f"there is no {what} {name!r}; there are: {', '.join(names)}")
+    if len(found) > 1:
+        ground = [key for key in found if key.level == GROUND]
+        if not ground:
+            levels = ", ".join(key.level for key in found)
+            raise Ambiguous(f"the {what} {name!r} is there on several levels, name one with level=…: {levels}")
+        found = ground
+    return found
