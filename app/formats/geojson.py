@@ -30,7 +30,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _json, register
 from app.formats._text import DEGREES, METRES
 from app.model.features import MAX_ID, NO_GEOMETRY, Features, Properties, unique_ids
 from app.model.frame import GROUND, MAX_METRES, Datum, Level
@@ -45,9 +45,6 @@ CONFORMS = "http://www.opengis.net/spec/json-fg-1/1.0/conf/core"
 OWN = "fleet_map"
 
 GEOMETRIES = ("Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon", "GeometryCollection")
-MAX_DEPTH = 128
-"""Nested arrays and objects. Real files have about ten; interpreters that recurse fail near a thousand."""
-
 WORDS = frozenset({"layer", "level", "part", "more"})
 
 _EARTH = re.compile(r"(?i)(?:.*\b(?:CRS84h?|WGS ?84)|.*EPSG(?::|/)[^/]*(?::|/)?(?:4326|4979)\b)")
@@ -86,31 +83,8 @@ def read(files: Files, context: ReadContext) -> Layers:
     places that are not on earth and for coordinate systems other than WGS 84; TooLarge beyond the limits.
     """
     data = files[context.main].removeprefix(b"\xef\xbb\xbf")
-    if len(data) > context.limits.text_bytes:
-        raise TooLarge(f"{context.main} has {len(data)} bytes; the limit for a text is {context.limits.text_bytes}")
-    try:
-        top = orjson.loads(data)
-    except orjson.JSONDecodeError as error:
-        reason = f"not JSON: {error.msg}"
-        raise UnreadableFile(reason, [Problem(reason, line=error.lineno)]) from error
-    _check_depth(data)
+    top = _json.load(data, context.limits)
     return _Reader(data, top, context).layers()
-
-
-def _check_depth(data: bytes) -> None:
-    """Refuse deep nesting of (well-formed) JSON, counting brackets outside of texts."""
-    plain = re.sub(rb"(?s)\\.", b"  ", data) if b"\\" in data else data
-    characters = np.frombuffer(plain, np.uint8)
-    in_text = np.bitwise_xor.accumulate((characters == ord('"')).view(np.uint8))
-    step = np.zeros(256, np.int8)
-    step[[ord("{"), ord("[")]] = 1
-    step[[ord("}"), ord("]")]] = -1
-    steps = step[characters]
-    steps[in_text != 0] = 0
-    steps = steps[steps != 0]
-    if len(steps) and int(np.cumsum(steps, dtype=np.int64).max()) > MAX_DEPTH:
-        reason = f"nested deeper than {MAX_DEPTH}"
-        raise UnreadableFile(reason, [Problem(reason)])
 
 
 def _marked(p: Any) -> bool:
