@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import Connection, Row, insert, select, update
 
@@ -11,7 +11,7 @@ from app.errors import Invalid, NotFound
 from app.store import outbox, tables
 from app.store.base import CHANNEL_NAME, Base, environment_row, text, utcnow
 from app.store.manifest import read_version
-from app.store.values import LATEST, Channel, Planned, rfc3339
+from app.store.values import LATEST, Channel, Planned, Version, rfc3339
 
 
 class Channels(Base):
@@ -161,23 +161,7 @@ def _move(connection: Connection, environment: Row[Any], channel: str, number: i
         **nothing,
     )
     _bump(connection, environment, sequence)
-    rollback = before is not None and number < before.number
-    outbox.append(
-        connection,
-        environment_id=environment.id,
-        environment=environment.name,
-        sequence=sequence,
-        kind="channel.moved",
-        version=number,
-        root=target.root,
-        previous=None if before is None else (before.number, before.root),
-        layers=outbox.layer_changes(before.parts if before else (), target.parts),
-        message=target.message,
-        author=author,
-        time=now,
-        channel=channel,
-        rollback=rollback,
-    )
+    _tell(connection, environment, "channel.moved", channel, before, target, sequence=sequence, author=author, time=now)
 
 
 def _plan(connection: Connection, environment: Row[Any], channel: str, number: int, author: str, at: datetime) -> None:
@@ -193,22 +177,33 @@ def _plan(connection: Connection, environment: Row[Any], channel: str, number: i
         plan |= {"version": None, "sequence": 0, "author": author, "time": now}
     _store(connection, environment, channel, known, **plan)
     _bump(connection, environment, sequence)
+    about: dict[str, Any] = {"sequence": sequence, "author": author, "time": now, "activate_at": rfc3339(at)}
+    _tell(connection, environment, "channel.planned", channel, before, target, **about)
+
+
+def _tell(
+    connection: Connection,
+    environment: Row[Any],
+    kind: Literal["channel.planned", "channel.moved"],
+    channel: str,
+    before: Version | None,
+    target: Version,
+    **about: Any,
+) -> None:
+    """The event of a channel that goes, or is planned to go, from one version to another."""
     outbox.append(
         connection,
         environment_id=environment.id,
         environment=environment.name,
-        sequence=sequence,
-        kind="channel.planned",
-        version=number,
+        kind=kind,
+        version=target.number,
         root=target.root,
         previous=None if before is None else (before.number, before.root),
         layers=outbox.layer_changes(before.parts if before else (), target.parts),
         message=target.message,
-        author=author,
-        time=now,
         channel=channel,
-        rollback=before is not None and number < before.number,
-        activate_at=rfc3339(at),
+        rollback=before is not None and target.number < before.number,
+        **about,
     )
 
 
