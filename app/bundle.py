@@ -234,8 +234,9 @@ def _set_aside(groups: list[Group], bundle: Bundle) -> list[Group]:
         if sibling in mains and mains[sibling].format is group.format:
             reason = f"{sibling} is used instead of what was generated"
         elif group.format.drawing and folder == "topological" and not _is_regions(name):
-            if ("tmap2", "topological") in kinds:
-                reason = "the network comes from the richer tmap2 file"
+            richer = next((n for n in ("tmap2", "tmap") if (n, "topological") in kinds), None)
+            if richer is not None:
+                reason = f"the network comes from the richer {richer} file"
         elif (
             group.format.drawing
             and folder == "location"

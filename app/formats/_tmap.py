@@ -1,0 +1,902 @@
+"""What tmap2 and tmap share: the networks of topological_navigation, as YAML.
+
+Nodes with poses, and directed edges listed in their source. Positions are metres in the local frame, orientations
+quaternions. Two layouts: the mapping (tmap2, also with a block of ``verts`` anchors on top) and the older list (tmap).
+Source: topological_navigation, config/tmap-schema.yaml and its map managers (manager.py reads the list, manager2.py the
+mapping).
+
+Canonical: a node's id is its name, an edge's id its ``edge_id``. What only these files know of an item is its
+``properties.tmap2``: a node's is the entry of the file, ``{meta?, node: {…}}``, less what is canonical or follows from
+the document; an edge's is its mapping in the file, less what is canonical. ``node.name`` and ``edge_id`` stand there
+only where they differ from the id (names may repeat), ``node.edges`` only for edges to nowhere. The document's
+``tmap2`` is the file's top level without the nodes, ``tmap`` says that it was a list. A node's or edge's own
+``properties`` in the file may hold canonical words (``speed_limit``, ``width``, ``name``) and what other formats know
+of it (``kml: {…}``): on reading these become canonical properties again, and on writing go there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import orjson
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import Problem, UnreadableFile
+from app.formats import Files, ReadContext, WriteContext, _yaml, all_formats
+from app.formats._text import METRES, numbers
+from app.model.features import Features, Properties, from_columns, points, unique_ids
+from app.model.frame import GROUND
+from app.model.layers import NETWORK, Layers, PartKey
+from app.parameters import parameter
+
+NAME = "tmap2"
+LAST_UPDATED = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}_[0-9]{2}-[0-9]{2}-[0-9]{2}\Z")
+EPOCH = "1970-01-01_00-00-00"
+"""Where a source tells no time: the schema asks for one, and the same network must give the same bytes."""
+
+MAX_NAME = 256
+LONGEST_ID = 480
+
+NODE_WORDS = frozenset({"edges", "name", "pose"})
+EDGE_WORDS = frozenset({"edge_id", "node", "action"})
+CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME})
+CANONICAL_EDGE = frozenset({"kind", "source", "target", "action", NAME})
+UNWRITTEN = frozenset({"drawn_from"})
+"""Canonical properties that speak of other parts of the environment, not of the item."""
+
+BULKY = frozenset({"osm"})
+"""What these formats know of an item is written on demand: OSM's tags and history are larger than all the rest."""
+
+NUMERIC_WORDS = ("speed_limit", "width")
+
+ACTION, ACTION_TYPE = "move_base", "move_base_msgs/MoveBaseGoal"
+RADIUS = 0.75
+RING = [
+    {"x": round(RADIUS * math.cos(a), 12), "y": round(RADIUS * math.sin(a), 12)}
+    for a in (math.pi / 8 + k * math.pi / 4 for k in range(8))
+]
+"""The influence zone of a node that has none: a regular octagon around it, metres from the node."""
+
+EDGE_TEMPLATE: Mapping[str, Any] = {
+    "config": [],
+    "fail_policy": "fail",
+    "fluid_navigation": True,
+    "goal": {"target_pose": {"header": {"frame_id": "$node.parent_frame"}, "pose": "$node.pose"}},
+    "recovery_behaviours_config": "",
+    "restrictions_planning": "True",
+    "restrictions_runtime": "True",
+}
+NODE_TEMPLATE: Mapping[str, Any] = {
+    "localise_by_topic": "",
+    "parent_frame": "map",
+    "restrictions_planning": "True",
+    "restrictions_runtime": "True",
+    "verts": RING,
+}
+TOLERANCES = {"xy_goal_tolerance": 0.3, "yaw_goal_tolerance": 0.1}
+ANY_YAW = 6.29
+"""Yaw tolerance of a node whose orientation is not known: any."""
+
+LIST_EDGE: Mapping[str, Any] = {"inflation_radius": 0.0, "recovery_behaviours_config": ""}
+LIST_NODE: Mapping[str, Any] = {"localise_by_topic": "", "verts": RING}
+"""What the list's reader takes of each item, less what depends on the map; it looks at no other key."""
+
+TRANSFORMATION = {
+    "child": "topo_map",
+    "parent": "map",
+    "rotation": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0},
+    "translation": {"x": 0.0, "y": 0.0, "z": 0.0},
+}
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What a robot does along edges whose source names no action, and what the file calls itself."""
+
+    action: str = parameter(ACTION, "action of edges that name none")
+    action_type: str = parameter(ACTION_TYPE, "type of that action's goal")
+    osm: bool = parameter(False, "write OpenStreetMap's tags and attributes under properties of nodes and edges")
+    pointset: str | None = parameter(
+        None, "name of the network and its pointset; default: the source's, else the map's"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ListOptions:
+    """What a robot does along edges whose source names no action, and what the pointset is called."""
+
+    action: str = parameter(ACTION, "action of edges that name none")
+    top_vel: float = parameter(0.55, "speed on edges without a limit", minimum=0.0, maximum=100.0, unit="m/s")
+    osm: bool = parameter(False, "write OpenStreetMap's tags and attributes under properties of nodes and edges")
+    pointset: str | None = parameter(None, "name of the pointset; default: the source's, else the map's")
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """The network as topology, or, where no node has an edge, its nodes as objects of kind ``poi``.
+
+    Coordinates are local metres; 2-D where z is 0. Raises UnreadableFile naming the node.
+    """
+    if not (context.wants("topology") or context.wants("objects")):
+        return Layers()
+    top = _yaml.load(files[context.main or next(iter(files))], context.limits)
+    legacy = isinstance(top, list)
+    entries, document = _top(top, context)
+    nodes = [_entry(entry, k) for k, entry in enumerate(entries)]
+    names = [_name(node.get("name"), k, context) for k, node in enumerate(nodes)]
+    ids = unique_ids(map(_identifier, names))
+    _warn_names(names, context)
+    place = {name: k for k, name in reversed(list(enumerate(names)))}
+
+    rows, dangling = _edges(nodes, names, place, context)
+    common = {"map": document.get("metric_map"), "pointset": document.get("pointset")}
+    xyz, orientations = _poses(nodes, names)
+    _to_local(xyz, orientations, nodes, document, context)
+    has_edges = bool(rows) or bool(dangling)
+    kind = "node" if has_edges or not nodes else "poi"
+    properties: list[Properties] = []
+    for k, (entry, node, name) in enumerate(zip(entries, nodes, names, strict=True)):
+        said: dict[str, Any] = {"kind": kind, "name": name}
+        if orientations[k] is not None:
+            said["orientation"] = orientations[k]
+        said[NAME] = own = _node_rest(entry, node, name, common)
+        if name != ids[k]:
+            own["node"]["name"] = name
+        if k in dangling:
+            own["node"]["edges"] = dangling[k]
+        _lift(said, own["node"])
+        properties.append(said)
+    geometry = _node_points(xyz)
+    whole: dict[str, Any] = {NAME: document, **({"tmap": {"layout": "list"}} if legacy else {})}
+    if kind == "poi":
+        context.warn(f"no node has an edge: the {len(nodes)} nodes are taken as points of interest")
+        key = PartKey("objects", context.level, NAME)
+        return Layers({key: from_columns(ids, geometry, properties, "local", whole)})
+
+    sources = np.array([r[0] for r in rows], np.intp)
+    targets = np.array([r[1] for r in rows], np.intp)
+    _warn_lonely(names, sources, targets, dangling, context)
+    edge_ids = unique_ids((_identifier(r[2]) for r in rows), set(ids))
+    repeated = []
+    for (source, target, said_id, edge), edge_id in zip(rows, edge_ids, strict=True):
+        rest = {key: value for key, value in edge.items() if key not in EDGE_WORDS}
+        line: dict[str, Any] = {"kind": "edge", "source": ids[source], "target": ids[target], NAME: rest}
+        if "action" in edge:
+            if isinstance(edge["action"], str):
+                line["action"] = edge["action"]
+            else:
+                rest["action"] = edge["action"]
+        if said_id != edge_id:
+            rest["edge_id"] = said_id
+            repeated.append(said_id)
+        if "properties" in rest:
+            _lift(line, rest)
+        properties.append(line)
+    if repeated:
+        context.warn(f"{len(repeated)} edge ids stand for several things: {_some(repeated)}; all are kept")
+    both = np.concatenate([geometry, _edge_lines(xyz, sources, targets)])
+    key = PartKey("topology", context.level, NETWORK)
+    return Layers({key: from_columns([*ids, *edge_ids], both, properties, "local", whole)})
+
+
+def _top(top: Any, context: ReadContext) -> tuple[list[Any], dict[str, Any]]:
+    """(entries of the nodes, everything else of the top level)."""
+    if isinstance(top, list):
+        document: dict[str, Any] = {}
+        for key, word in (("metric_map", "map"), ("pointset", "pointset"), ("name", "pointset")):
+            metas = (e["meta"].get(word) for e in top if isinstance(e, dict) and isinstance(e.get("meta"), dict))
+            most = Counter(m for m in metas if isinstance(m, str)).most_common(1)
+            if most:
+                document[key] = most[0][0]
+        return top, document
+    if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
+        raise UnreadableFile("there is no list of nodes: not a topological map", [Problem("no list", where="nodes")])
+    document = {key: value for key, value in top.items() if key != "nodes"}
+    for key in ("name", "metric_map", "pointset"):
+        if key not in document:
+            context.warn("is missing; tmap2 readers ask for it", where=key)
+        elif not isinstance(document[key], str):
+            context.warn(f"is {document[key]!r}, not a text; it is served as a text", where=key)
+    return top["nodes"], document
+
+
+def _entry(entry: Any, k: int) -> dict[str, Any]:
+    node = entry.get("node") if isinstance(entry, dict) else None
+    if not isinstance(node, dict):
+        raise UnreadableFile(f"nodes[{k}] has no mapping 'node'", [Problem("no mapping 'node'", where=f"nodes[{k}]")])
+    edges = node.get("edges")
+    if edges is not None and not (isinstance(edges, list) and all(isinstance(e, dict) for e in edges)):
+        where = f"nodes[{k}].node.edges"
+        raise UnreadableFile(
+            f"{where} must be a list of mappings", [Problem("must be a list of mappings", where=where)]
+        )
+    if not isinstance(entry.get("meta", {}), (dict, type(None))):
+        raise UnreadableFile(f"nodes[{k}].meta must be a mapping", [Problem("not a mapping", where=f"nodes[{k}].meta")])
+    return node
+
+
+def _name(said: Any, k: int, context: ReadContext) -> str:
+    where = f"nodes[{k}].node.name"
+    name = said if isinstance(said, str) else ""
+    if not isinstance(said, str):
+        if said is None or isinstance(said, (dict, list)):
+            raise UnreadableFile(f"{where}: a node must have a name", [Problem("a node must have a name", where=where)])
+        context.warn(f"the name {said!r} is no text; it is served as one", where=where)
+        name = _yaml.text(said)
+    if not 0 < len(name) <= MAX_NAME or (
+        not name.isprintable() and any(unicodedata.category(c) in ("Cc", "Zl", "Zp") for c in name)
+    ):
+        reason = f"a name must have 1 to {MAX_NAME} characters and no control characters"
+        raise UnreadableFile(f"{where}: {reason}", [Problem(f"{reason}, got {name[:60]!r}", where=where)])
+    return name
+
+
+def _identifier(name: str) -> str:
+    """A usable id: the name itself but for invisible characters, other Unicode forms of it, and its length."""
+    if name.isascii() and name.isprintable() and len(name) <= LONGEST_ID:
+        return name
+    plain = unicodedata.normalize("NFC", name)
+    plain = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in plain)
+    if len(plain) > LONGEST_ID:
+        plain = f"{plain[: LONGEST_ID - 17]}~{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+    return plain
+
+
+def _warn_names(names: Sequence[str], context: ReadContext) -> None:
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    if repeated:
+        context.warn(
+            f"{len(repeated)} node names stand twice or more: {_some(repeated)}; edges to them go to the first"
+        )
+    for name in names:
+        if not name.isascii() and not name.isprintable():
+            context.warn(f"the name {name!r} has invisible characters", where=name)
+
+
+def _some(names: Sequence[Any]) -> str:
+    return ", ".join(map(str, names[:5])) + (" …" if len(names) > 5 else "")
+
+
+Row = tuple[int, int, str, dict[str, Any]]
+
+
+def _edges(
+    nodes: Sequence[dict[str, Any]], names: Sequence[str], place: Mapping[str, int], context: ReadContext
+) -> tuple[list[Row], dict[int, list[Any]]]:
+    """((source, target, edge id, mapping) of each edge between nodes; the edges to nowhere by node)."""
+    rows: list[Row] = []
+    dangling: dict[int, list[Any]] = {}
+    loops = []
+    for k, node in enumerate(nodes):
+        for edge in node.get("edges") or ():
+            to = edge.get("node")
+            if not isinstance(to, str) and to is not None and not isinstance(to, (dict, list)):
+                to = _yaml.text(to)
+            target = place.get(to) if isinstance(to, str) else None
+            said = edge.get("edge_id")
+            if not isinstance(said, str):
+                said = f"{names[k]}_{to}" if said is None or isinstance(said, (dict, list)) else _yaml.text(said)
+            if target is None:
+                dangling.setdefault(k, []).append(edge)
+                context.warn(
+                    f"the edge {said!r} leads to {to!r}, which is no node; it is kept with its node", where=names[k]
+                )
+                continue
+            if target == k:
+                loops.append(said)
+            rows.append((k, target, said or f"{names[k]}_{to}", edge))
+    if loops:
+        context.warn(f"{len(loops)} edges lead from a node to itself: {_some(loops)}")
+    return rows, dangling
+
+
+def _warn_lonely(
+    names: Sequence[str],
+    sources: NDArray[np.intp],
+    targets: NDArray[np.intp],
+    dangling: Mapping[int, Any],
+    context: ReadContext,
+) -> None:
+    linked = np.zeros(len(names), bool)
+    linked[sources] = linked[targets] = linked[list(dangling)] = True
+    lonely = [names[k] for k in np.flatnonzero(~linked).tolist()]
+    if lonely:
+        context.warn(f"{len(lonely)} nodes have no edges: {_some(lonely)}")
+
+
+def _poses(nodes: Sequence[dict[str, Any]], names: Sequence[str]) -> tuple[Array, list[list[float] | None]]:
+    """(float64 [n, 3] positions in metres, a quaternion [x, y, z, w] or None for each)."""
+    positions: list[tuple[Any, ...]] = []
+    orientations: list[list[float] | None] = []
+    for node, name in zip(nodes, names, strict=True):
+        try:
+            pose = node["pose"]
+            at, turned = pose["position"], pose.get("orientation")
+            positions.append((at["x"], at["y"], at.get("z", 0.0)))
+            orientations.append(None if turned is None else [turned["x"], turned["y"], turned["z"], turned["w"]])
+        except (KeyError, TypeError, AttributeError, IndexError) as error:
+            reason = f"the node {name!r} needs pose.position with x and y, and x, y, z, w in its orientation, if any"
+            raise UnreadableFile(reason, [Problem(reason, where=f"{name}.pose")]) from error
+    xyz = _numbers(positions, 3, names, "position")
+    given = [k for k, o in enumerate(orientations) if o is not None]
+    turned = _numbers([tuple(orientations[k] or ()) for k in given], 4, [names[k] for k in given], "orientation")
+    for k, row in zip(given, turned.tolist(), strict=True):
+        orientations[k] = row
+    return xyz, orientations
+
+
+def _numbers(rows: Sequence[tuple[Any, ...]], width: int, names: Sequence[str], what: str) -> Array:
+    """float64 [n, width]; a number that stands in quotes is one too."""
+    flat = [v for row in rows for v in row]
+    if not all(map((float, int).__contains__, map(type, flat))):
+        for k, value in enumerate(flat):
+            flat[k] = _number(value, f"{names[k // width]}.pose.{what}")
+    return np.array(flat, np.float64).reshape(-1, width)
+
+
+def _number(value: Any, where: str) -> float:
+    try:
+        number = _yaml.scalar(value) if isinstance(value, str) else value
+    except ValueError:
+        number = None
+    if isinstance(number, bool) or not isinstance(number, (int, float)):
+        raise UnreadableFile(
+            f"{where}: {value!r} is not a number", [Problem(f"{value!r} is not a number", where=where)]
+        )
+    return float(number)
+
+
+def _node_rest(
+    entry: Mapping[str, Any], node: Mapping[str, Any], name: str, common: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What of a node's entry is neither canonical nor said by the document."""
+    rest = {key: value for key, value in node.items() if key not in NODE_WORDS}
+    pose = node["pose"]
+    if len(pose) > 2 or len(pose["position"]) > 3 or len(pose.get("orientation") or ()) not in (0, 4):
+        more = {key: value for key, value in pose.items() if key not in ("position", "orientation")}
+        for word, axes in (("position", "xyz"), ("orientation", "xyzw")):
+            extra = {key: value for key, value in (pose.get(word) or {}).items() if key not in axes}
+            more |= {word: extra} if extra else {}
+        if more:
+            rest["pose"] = more
+    out: dict[str, Any] = {"node": rest}
+    if len(entry) > 2:
+        out |= {key: value for key, value in entry.items() if key not in ("meta", "node")}
+    meta = {
+        key: value
+        for key, value in (entry.get("meta") or {}).items()
+        if not (value == name if key == "node" else key in common and common[key] == value)
+    }
+    if meta:
+        out["meta"] = meta
+    return out
+
+
+def _lift(said: dict[str, Any], rest: dict[str, Any]) -> None:
+    """Bring canonical words and other formats' knowledge from an item's ``properties`` to where they belong."""
+    own = rest.get("properties")
+    if not isinstance(own, dict):
+        return
+    lifted = {
+        key: value
+        for key, value in own.items()
+        if (key in NUMERIC_WORDS and isinstance(value, (int, float)) and not isinstance(value, bool))
+        or (key == "name" and isinstance(value, str) and value not in ("", said.get("name")))
+        or (isinstance(value, dict) and key in _families() and key != NAME)
+    }
+    if lifted:
+        said.update(lifted)
+        rest["properties"] = {key: value for key, value in own.items() if key not in lifted}
+        if not rest["properties"]:
+            del rest["properties"]
+
+
+@cache
+def _families() -> frozenset[str]:
+    """Names under which formats keep what only they know of an item."""
+    return frozenset(all_formats())
+
+
+def _node_points(xyz: Array) -> NDArray[np.object_]:
+    """Points, 2-D where z is 0."""
+    out = points(np.ascontiguousarray(xyz[:, :2]))
+    high = xyz[:, 2] != 0
+    if high.any():
+        out[high] = points(xyz[high])
+    return out
+
+
+def _edge_lines(xyz: Array, sources: NDArray[np.intp], targets: NDArray[np.intp]) -> NDArray[np.object_]:
+    """Lines of two points from node to node, 2-D where both lie at 0."""
+    ends = np.stack([xyz[sources], xyz[targets]], axis=1)
+    out: NDArray[np.object_] = np.empty(len(ends), object)
+    high = (ends[:, :, 2] != 0).any(axis=1)
+    if not high.all():
+        out[~high] = shapely.linestrings(ends[~high][:, :, :2])
+    if high.any():
+        out[high] = shapely.linestrings(ends[high])
+    return out
+
+
+# --- frames ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Turn:
+    """A file's ``transformation``: a pose in the child frame, turned and shifted, is one in the local frame."""
+
+    child: str
+    quaternion: tuple[float, float, float, float]
+    shift: Array
+
+    def matrix(self) -> Array:
+        """Rotation matrix [3, 3] of the quaternion (x, y, z, w)."""
+        x, y, z, w = self.quaternion
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+
+def _turn(document: Mapping[str, Any]) -> _Turn | None:
+    """The file's transformation, where there is one that changes anything."""
+    said = document.get("transformation")
+    if not isinstance(said, dict) or not isinstance(said.get("child"), str) or said["child"] == said.get("parent"):
+        return None
+    rotation, translation = said.get("rotation") or {}, said.get("translation") or {}
+    if not isinstance(rotation, dict) or not isinstance(translation, dict):
+        return None
+    where = "transformation"
+    x, y, z = (_number(rotation.get(key, 0.0), f"{where}.rotation.{key}") for key in "xyz")
+    w = _number(rotation.get("w", 1.0), f"{where}.rotation.w")
+    shift = np.array([_number(translation.get(key, 0.0), f"{where}.translation.{key}") for key in "xyz"])
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    if not math.isfinite(length) or length < 1e-9:
+        raise UnreadableFile(
+            "transformation.rotation is no rotation", [Problem("no rotation", where=f"{where}.rotation")]
+        )
+    if x == y == z == 0.0 and not shift.any():
+        return None
+    return _Turn(said["child"], (x / length, y / length, z / length, w / length), shift)
+
+
+def _times(a: Sequence[float], b: Sequence[float]) -> list[float]:
+    """The product of two quaternions (x, y, z, w): first b, then a."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return [
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    ]
+
+
+def _to_local(
+    xyz: Array,
+    orientations: list[list[float] | None],
+    nodes: Sequence[Mapping[str, Any]],
+    document: Mapping[str, Any],
+    context: ReadContext,
+) -> None:
+    """Bring the poses of nodes whose parent_frame is the transformation's child to the local frame, in place."""
+    turn = _turn(document)
+    if turn is None:
+        return
+    inside = [k for k, node in enumerate(nodes) if node.get("parent_frame") == turn.child]
+    if not inside:
+        return
+    xyz[inside] = xyz[inside] @ turn.matrix().T + turn.shift
+    for k in inside:
+        orientations[k] = _times(turn.quaternion, orientations[k] or [0.0, 0.0, 0.0, 1.0])
+    context.warn(
+        f"{len(inside)} nodes stand in the frame {turn.child!r} and were brought to the local one by the file's "
+        "transformation"
+    )
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def write(layers: Layers, context: WriteContext, *, listed: bool = False) -> bytes:
+    """The text of a file: all networks of the environment in one, nodes and edges sorted by length and text of id.
+
+    listed: as the older list. Wgs84 items are brought to local metres (MissingDatum without a datum). What the source
+    did not say is filled in.
+    """
+    return _Writer(layers, context, listed=listed).file().encode()
+
+
+Lines = list[tuple[int, str, str]]
+"""(length, name or id, text) of nodes or edges: sorted so, WayPoint9 stands before WayPoint10."""
+
+
+class _Writer:
+    """One file being written: its head, the templates of items met so far, counts for the report."""
+
+    def __init__(self, layers: Layers, context: WriteContext, *, listed: bool) -> None:
+        self.layers, self.context, self.listed = layers, context, listed
+        kind = ListOptions if listed else WriteOptions
+        self.options: WriteOptions | ListOptions = context.options if isinstance(context.options, kind) else kind()
+        self.document = self._document()
+        self.turn = _turn(self.document)
+        self.legacy = False  # whether the network at hand came as the older list, which lacks much that tmap2 asks for
+        self.unwritten = UNWRITTEN if self.options.osm else UNWRITTEN | BULKY
+        # Properties without anything for an item's own ``properties``.
+        self.plain_node, self.plain_edge = CANONICAL_NODE | self.unwritten, CANONICAL_EDGE | self.unwritten
+        self.templates: dict[Any, list[str]] = {}
+        self.filled: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+
+    def _document(self) -> dict[str, Any]:
+        """The top level without the nodes: as the source says, completed."""
+        known = list(self.layers.vector("topology").values())
+        known += [part for key, part in self.layers.vector("objects").items() if key.name == NAME]
+        said: Any = next((p.document[NAME] for p in known if isinstance(p.document.get(NAME), Mapping)), {})
+        document = {key: value for key, value in said.items() if key != "nodes"}
+        usual = next((document[key] for key in ("pointset", "name", "metric_map") if document.get(key)), None)
+        title = usual if isinstance(usual, str) else self.context.title
+        if self.listed:
+            more = [key for key in document if key not in ("metric_map", "pointset")]
+            if document.get("name") == document.get("pointset"):
+                more = [key for key in more if key != "name"]
+            self.context.drop("top level keys of a tmap2 file", len(more), "a list has no place for " + _some(more))
+            document = {key: document[key] for key in ("metric_map", "pointset") if key in document}
+        for key in ("metric_map", "pointset") if self.listed else ("metric_map", "name", "pointset"):
+            value = document.get(key)
+            if value is None or isinstance(value, (dict, list)):
+                document[key] = title
+                self.context.fill(key, title, "no source names it")
+            elif not isinstance(value, str):
+                document[key] = _yaml.text(value)
+                self.context.warn(f"the source's {key} is no text; {document[key]!r} is written", where=key)
+        if self.options.pointset is not None:
+            document["name"] = document["pointset"] = self.options.pointset
+        if self.listed:
+            return document
+        meta = dict(document["meta"]) if isinstance(document.get("meta"), dict) else {}
+        updated = meta.get("last_updated")
+        if not (isinstance(updated, str) and LAST_UPDATED.match(updated)):
+            meta["last_updated"] = EPOCH
+            self.context.fill("meta.last_updated", EPOCH, "no source tells it in the form that the schema wants")
+            if updated is not None:
+                self.context.warn(f"last_updated {updated!r} is no time; {EPOCH} is written", where="meta.last_updated")
+        document["meta"] = meta
+        if "transformation" not in document:
+            document["transformation"] = TRANSFORMATION
+            self.context.fill("transformation", "identity, from map to topo_map", "no source names it")
+        return document
+
+    def file(self) -> str:
+        """The whole text."""
+        nodes: Lines = []
+        taken: set[str] = set()
+        networks = self.layers.vector("topology")
+        for key, part in networks.items():
+            nodes += self._network(part, key.level, taken)
+        if len({key.level for key in networks}) > 1:
+            count = sum(len(part) for key, part in networks.items() if key.level != GROUND)
+            why = "the format knows no levels: all networks are joined, 2-D points at their level's elevation"
+            self.context.drop("levels of nodes and edges", count, why)
+        self._report()
+        if self.listed:
+            return _listed(nodes).removeprefix("\n").lstrip(" ")
+        before, after = _split({**self.document, "nodes": None}, 0, "nodes")
+        return f"{before}{_listed(nodes)}{after}"
+
+    def _network(self, part: Features, level: str, taken: set[str]) -> Lines:
+        """The nodes of a network, each with its edges."""
+        self.legacy = "tmap" in part.document
+        is_point = (shapely.get_type_id(part.geometry) == 0) & ~shapely.is_empty(part.geometry)
+        kinds = [p.get("kind") for p in part.properties]
+        places = [k for k, point in enumerate(is_point.tolist()) if point and kinds[k] == "node"]
+        names = self._names(part, places, taken)
+        said = {i: _yaml.text(name) for i, name in names.items()}
+        edges = self._edges(part, kinds, said)
+        coordinates = self._positions(part, places, 0.0 if level == GROUND else self.layers.elevation(level))
+        out = []
+        plain = self._plain_node()
+        for place, at in zip(places, coordinates, strict=True):
+            i, p = part.ids[place], part.properties[place]
+            name = names[i]
+            if self._is_plain(p, self.plain_node) and "orientation" not in p and p.get("name", name) == name:
+                self.filled["nodes"] += 1
+                self.filled["orientations"] += 1
+                text = plain(said[i], _listed(edges[i]), at)
+            else:
+                text = self._node(p, name, said[i], at, edges[i])
+            out.append((len(name), name, text))
+        return out
+
+    def _is_plain(self, p: Properties, words: frozenset[str]) -> bool:
+        """Whether an item comes from another format and has nothing for its own ``properties``."""
+        return NAME not in p and not self.legacy and p.keys() <= words
+
+    def _plain_node(self) -> Callable[[str, str, tuple[str, str, str]], str]:
+        """The quick way for nodes that have only a name and a place: (name, edges, position) as texts -> entry."""
+        a, b, c, d, e = self._node_template({}, {}, None, known=False, fill=True)
+        d += self._pose(None, ("\0", "\0", "\0"), [0.0, 0.0, 0.0, 1.0], turned=False)
+        d, y, z, end = d.split("\0")
+        e = end + e
+
+        def plain(said: str, listed: str, at: tuple[str, str, str]) -> str:
+            return f"{a} {said}\n{b}{listed}{c} {said}\n{d}{at[0]}{y}{at[1]}{z}{at[2]}{e}"
+
+        return plain
+
+    def _names(self, part: Features, places: Sequence[int], taken: set[str]) -> dict[str, str]:
+        """What each node is called in the file, by id. Names repeat where they did so in their source."""
+        wanted = []
+        for k in places:
+            own = part.properties[k].get(NAME)
+            node = own.get("node") if isinstance(own, dict) else None
+            said = node.get("name") if isinstance(node, dict) else None
+            wanted.append(said if isinstance(said, str) and said else part.ids[k])
+        clashing = sorted({name for name in wanted if name in taken})
+        if clashing:
+            renamed = dict(zip(clashing, unique_ids(clashing, taken | set(wanted)), strict=True))
+            wanted = [renamed.get(name, name) for name in wanted]
+            self.context.warn(f"{len(clashing)} names stand in several networks and got a number: {_some(clashing)}")
+        taken.update(wanted)
+        return {part.ids[k]: name for k, name in zip(places, wanted, strict=True)}
+
+    def _edges(self, part: Features, kinds: Sequence[Any], said: Mapping[str, str]) -> dict[str, Lines]:
+        """The edges by the id of the node that they start at. said: each node's name as YAML, by id."""
+        edges: dict[str, Lines] = {i: [] for i in said}
+        a, b, c = self._edge_template({}, None, None, fill=True)
+        plain = lost = 0
+        for i, p, kind in zip(part.ids, part.properties, kinds, strict=True):
+            source, target = p.get("source"), p.get("target")
+            if not (kind == "edge" and isinstance(source, str) and isinstance(target, str) and source in said):
+                lost += kind != "node"
+                continue
+            to = said.get(target) or _yaml.text(target)
+            if self._is_plain(p, self.plain_edge) and "action" not in p:
+                plain += 1
+                text = f"{a} {_yaml.text(i)}\n{b} {to}\n{c}"
+            else:
+                text = self._edge(p, i, to)
+            edges[source].append((len(i), i, text))
+        self.filled["edges"] += plain
+        self.dropped["items that are neither a node nor an edge from a node"] += lost
+        self.dropped["nodes without a point"] += kinds.count("node") - len(said)
+        bent = (shapely.get_num_coordinates(part.geometry) > 2) & [kind == "edge" for kind in kinds]
+        self.dropped["edges' bends between their nodes"] += int(bent.sum())
+        return edges
+
+    def _positions(self, part: Features, places: Sequence[int], elevation: float) -> list[tuple[str, str, str]]:
+        """x, y, z as texts: metres in the frame that each node's parent_frame names."""
+        chosen = part.take(places)
+        xyz: Array = shapely.get_coordinates(chosen.in_local(self.layers.frame), include_z=True).reshape(-1, 3)
+        xyz[np.isnan(xyz[:, 2]), 2] = elevation
+        if self.turn is not None:
+            inside = [k for k, p in enumerate(chosen.properties) if self._turned(p)]
+            xyz[inside] = (xyz[inside] - self.turn.shift) @ self.turn.matrix()
+        said = list(map(_yaml.decimal, numbers(xyz.ravel(), METRES)))
+        return list(zip(said[::3], said[1::3], said[2::3], strict=True))
+
+    def _turned(self, p: Properties) -> bool:
+        """Whether a node's pose stands in the child frame of the transformation."""
+        own = p.get(NAME)
+        node = own.get("node") if isinstance(own, dict) else None
+        return self.turn is not None and isinstance(node, dict) and node.get("parent_frame") == self.turn.child
+
+    def _edge(self, p: Properties, i: str, target: str) -> str:
+        """The text of an edge. target: its target's name as YAML."""
+        own, action = p.get(NAME), p.get("action")
+        rest: dict[str, Any] = own if isinstance(own, dict) else {}
+        if "edge_id" in rest:
+            i = str(rest["edge_id"])
+            rest = {key: value for key, value in rest.items() if key != "edge_id"}
+        more = None if p.keys() <= self.plain_edge else self._more(p, CANONICAL_EDGE)
+        fill = own is None or self.legacy
+        self.filled["edges"] += own is None if self.listed else fill
+        # Edges alike but for their id and target share their text.
+        key = orjson.dumps((action, rest, more, fill)) if rest or more or action else fill
+        pieces = self.templates.get(key)
+        if pieces is None:
+            pieces = self.templates[key] = self._edge_template(rest, action, more, fill=fill)
+        return f"{pieces[0]} {_yaml.text(i)}\n{pieces[1]} {target}\n{pieces[2]}"
+
+    def _edge_template(
+        self, rest: Mapping[str, Any], action: Any, more: dict[str, Any] | None, *, fill: bool
+    ) -> list[str]:
+        """The text of an edge in three pieces, around its id and its target."""
+        if isinstance(self.options, ListOptions):
+            limit = (more or {}).get("speed_limit")
+            speed = limit if isinstance(limit, (int, float)) and not isinstance(limit, bool) else self.options.top_vel
+            fixed = {"map_2d": self.document["metric_map"], "top_vel": float(speed)}
+            out = {**LIST_EDGE, **fixed, **rest}
+        else:
+            out = {**EDGE_TEMPLATE, "action_type": self.options.action_type, **rest} if fill else dict(rest)
+        if action is not None:
+            out["action"] = action
+        if fill or self.listed:
+            out.setdefault("action", self.options.action)
+        if more:
+            out["properties"] = {**_mapping_of(rest.get("properties")), **more}
+        pieces = _split({**out, "edge_id": None, "node": None}, 6, "edge_id", "node")
+        pieces[0] = f"    - {pieces[0][6:]}"
+        return pieces
+
+    def _node(self, p: Properties, name: str, said: str, at: tuple[str, str, str], edges: Lines) -> str:
+        """The text of a node's entry. said: its name as YAML. at: its position as texts."""
+        own = p.get(NAME)
+        rest: dict[str, Any] = own if isinstance(own, dict) else {}
+        node = _mapping_of(rest.get("node"))
+        more = None
+        if not p.keys() <= self.plain_node or p.get("name", name) != name:
+            more = self._more(p, CANONICAL_NODE)
+            if isinstance(p.get("name"), str) and p["name"] not in ("", name):
+                more["name"] = p["name"]
+        if "name" in node or "edges" in node:
+            dangling = [e for e in node.get("edges") or () if isinstance(e, dict)]
+            edges = edges + [_dangling(e, name) for e in dangling]
+            node = {key: value for key, value in node.items() if key not in ("name", "edges")}
+            rest = {**rest, "node": node}
+        quaternion = _quaternion(p.get("orientation"))
+        self.filled["orientations"] += quaternion is None
+        fill = own is None or self.legacy
+        self.filled["nodes"] += own is None if self.listed else fill
+        key = ("node", quaternion is None, fill, orjson.dumps((rest, more)) if rest or more else None)
+        pieces = self.templates.get(key)
+        if pieces is None:
+            pieces = self.templates[key] = self._node_template(
+                rest, node, more, known=quaternion is not None, fill=fill
+            )
+        meta = rest.get("meta")
+        called = _yaml.text(str(meta["node"])) if isinstance(meta, dict) and "node" in meta else said
+        pose = self._pose(node.get("pose"), at, quaternion or [0.0, 0.0, 0.0, 1.0], turned=self._turned(p))
+        return f"{pieces[0]} {called}\n{pieces[1]}{_listed(edges)}{pieces[2]} {said}\n{pieces[3]}{pose}{pieces[4]}"
+
+    def _pose(self, extra: Any, at: tuple[str, str, str], quaternion: list[float], *, turned: bool) -> str:
+        """What stands behind ``pose:``."""
+        if turned and self.turn is not None:
+            x, y, z, w = self.turn.quaternion
+            quaternion = _times((-x, -y, -z, w), quaternion)
+        if isinstance(extra, dict):
+            position = {**dict(zip("xyz", map(float, at), strict=True)), **_mapping_of(extra.get("position"))}
+            orientation = {**dict(zip("xyzw", quaternion, strict=True)), **_mapping_of(extra.get("orientation"))}
+            return _yaml.block({**extra, "orientation": orientation, "position": position}, 4)
+        ox, oy, oz, ow = map(_yaml.text, quaternion)
+        return (
+            f"\n      orientation:\n        w: {ow}\n        x: {ox}\n        y: {oy}\n        z: {oz}\n"
+            f"      position:\n        x: {at[0]}\n        y: {at[1]}\n        z: {at[2]}\n"
+        )
+
+    def _node_template(
+        self, rest: Mapping[str, Any], node: Mapping[str, Any], more: dict[str, Any] | None, *, known: bool, fill: bool
+    ) -> list[str]:
+        """The text of a node's entry in five pieces, around meta.node, edges, name and pose."""
+        inner = dict(node)
+        if self.listed:
+            own = _mapping_of(inner.get("properties"))
+            usual = TOLERANCES if known else {**TOLERANCES, "yaw_goal_tolerance": ANY_YAW}
+            tolerances = {key: own.get(key, value) for key, value in usual.items()}
+            fixed = {"map": self.document["metric_map"], "pointset": self.document["pointset"]}
+            inner = {**LIST_NODE, **fixed, **tolerances, **inner}
+        elif fill:
+            inner = {**NODE_TEMPLATE, **inner}
+            tolerances = TOLERANCES if known else {**TOLERANCES, "yaw_goal_tolerance": ANY_YAW}
+            # The older layout has its tolerances beside the name.
+            tolerances = {key: inner.get(key, value) for key, value in tolerances.items()}
+            inner["properties"] = {**tolerances, **_mapping_of(inner.get("properties"))}
+        elif "nav_frame" not in inner:
+            inner.setdefault("parent_frame", "map")
+        if more:
+            inner["properties"] = {**_mapping_of(inner.get("properties")), **more}
+        meta = {"map": self.document["metric_map"], "pointset": self.document["pointset"]}
+        meta = {**meta, **_mapping_of(rest.get("meta")), "node": None}
+        head, middle = _split(meta, 4, "node")
+        pieces = _split({**inner, "edges": None, "name": None, "pose": None}, 4, "edges", "name", "pose")
+        before, between, after = _split({**rest, "meta": None, "node": None}, 2, "meta", "node")
+        opening = f"{before}\n{head}"
+        return [f"- {opening[2:]}", f"{middle}{between}\n{pieces[0]}", pieces[1], pieces[2], pieces[3] + after]
+
+    def _more(self, p: Properties, canonical: frozenset[str]) -> dict[str, Any]:
+        """Canonical words and other formats' knowledge, for an item's own ``properties``."""
+        return {key: value for key, value in p.items() if key not in canonical and key not in self.unwritten}
+
+    def _report(self) -> None:
+        fill, filled = self.context.fill, self.filled
+        if filled["edges"]:
+            why = f"{filled['edges']} edges come from a format that does not say it"
+            fill("edges: action", self.options.action, f"{why}, where they name none")
+            if isinstance(self.options, ListOptions):
+                fill("edges: top_vel", self.options.top_vel, f"{why}, where they have no speed limit")
+                fill("edges: inflation_radius, map_2d, recovery_behaviours_config", "the usual ones", why)
+            else:
+                said = "action_type, config, fail_policy, fluid_navigation, goal, restrictions"
+                fill(f"edges: {said}", "the usual ones", why)
+        if filled["nodes"]:
+            why = f"{filled['nodes']} nodes come from a format that does not say it"
+            fill("nodes: verts", f"an octagon of {RADIUS} m", f"{why}, where they have none")
+            said = "map, pointset" if self.listed else "parent_frame, restrictions"
+            fill(f"nodes: tolerances, localise_by_topic, {said}", "the usual ones", why)
+        if filled["orientations"]:
+            fill("nodes: pose.orientation", [0.0, 0.0, 0.0, 1.0], f"{filled['orientations']} nodes have none")
+        for what, count in sorted(self.dropped.items()):
+            self.context.drop(what, count, "the format has no place for it")
+        for family in sorted(BULKY & self.unwritten):
+            items = [p for part in self.layers.vector("topology").values() for p in part.properties if family in p]
+            self.context.drop(f"{family} tags and attributes", len(items), f"left out for size; ask with {family}=true")
+
+
+def _listed(items: Lines) -> str:
+    """What stands behind ``edges:`` or ``nodes:``."""
+    return "\n" + "".join([text for _, _, text in sorted(items)]) if items else " []\n"
+
+
+def _mapping_of(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _quaternion(value: Any) -> list[float] | None:
+    """Four finite numbers, else None."""
+    if not isinstance(value, (list, tuple)) or len(value) != 4:
+        return None
+    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in value):
+        return None
+    return list(map(float, value))
+
+
+def _dangling(edge: Mapping[str, Any], name: str) -> tuple[int, str, str]:
+    """An edge to nowhere as it was, with the id that the schema asks for."""
+    said = edge.get("edge_id")
+    i = said if isinstance(said, str) and said else f"{name}_{edge.get('node')}" if said is None else str(said)
+    return len(i), i, f"    - {_yaml.mapping({**edge, 'edge_id': i}, 6)[6:]}"
+
+
+def _split(values: Mapping[str, Any], column: int, *holes: str) -> list[str]:
+    """A mapping's text in pieces around the values of these keys, which are named in alphabetical order.
+
+    A piece before a hole ends with the key's colon, so that what is put there brings its space and its line break.
+    """
+    pieces = []
+    part: dict[str, Any] = {}
+    for key in sorted(values):
+        if key in holes:
+            pieces.append(f"{_yaml.mapping(part, column) if part else ''}{' ' * column}{key}:")
+            part = {}
+        else:
+            part[key] = values[key]
+    return [*pieces, _yaml.mapping(part, column) if part else ""]
+
+
+# --- telling ---------------------------------------------------------------------------------------------------------
+
+_MAPPING = re.compile(rb"(?m)^(?:metric_map|pointset)\s*:")
+_LIST = re.compile(rb"\A(?:\xef\xbb\xbf)?\s*(?:#[^\n]*\n\s*|---\s*)*- +(?:meta|node):[ \t]*(?:[\r\n{#])")
+HEAD = 4096
+
+
+def is_list(data: bytes) -> bool:
+    """Whether this is the older list, judged by its first entry."""
+    return bool(_LIST.match(data[:HEAD])) and b"node" in data
+
+
+def is_mapping(data: bytes) -> bool:
+    """Whether this is YAML with tmap2's top-level keys."""
+    return b"nodes" in data and bool(_MAPPING.search(data))
+
+
+def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
+    """The networks, and the points of interest that came from a tmap2 or tmap file."""
+    return [key for key in keys if key.layer == "topology" or (key.layer == "objects" and key.name == NAME)]

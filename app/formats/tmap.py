@@ -1,0 +1,45 @@
+"""tmap: the older networks of topological_navigation (strands_navigation), a YAML list of nodes: ``*.tmap``.
+
+See ``app.formats._tmap``. What its reader (topological_navigation, manager.py) takes of a node: ``name``, ``map``,
+``pointset``, ``pose``, ``verts``, ``edges``, ``localise_by_topic``, ``xy_goal_tolerance`` and ``yaw_goal_tolerance``;
+of an edge: ``edge_id``, ``node``, ``action``, ``top_vel``, ``map_2d``, ``inflation_radius`` and
+``recovery_behaviours_config``. All of these are written; further keys, at which it does not look, are kept.
+"""
+
+from __future__ import annotations
+
+from app.formats import Format, Needs, WriteContext, _tmap, register
+from app.model.layers import Layers
+
+FILE = "map.tmap"
+ENDS = (".tmap", ".yaml", ".yml", ".tmap2")
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``map.tmap``; see ``_tmap.write``. The map's name and transformation have no place in it."""
+    return {FILE: _tmap.write(layers, context, listed=True)}
+
+
+def detect(name: str, data: bytes) -> bool:
+    """A YAML list whose first entry is that of a node."""
+    return name.lower().endswith(ENDS) and _tmap.is_list(data)
+
+
+register(
+    Format(
+        name="tmap",
+        title="Topological map, the older list (strands_navigation)",
+        files=(FILE,),
+        media_types=("application/yaml",),
+        carries=frozenset({"topology", "objects"}),
+        detect=detect,
+        read=_tmap.read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        write_options=_tmap.ListOptions,
+        family=_tmap.NAME,
+        rank=49,
+        extensions=(".tmap",),
+        choose=_tmap.choose,
+    )
+)
