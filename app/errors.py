@@ -7,20 +7,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that is wrong or doubtful, and where: file name, line (from 1), key or element path."""
+    """One thing that is wrong or doubtful, and where: file name, line (from 1), key or element path.
+
+    level: of a finding about a served or checked map: ``error`` where its consumer would refuse or misread it,
+    ``warning`` where it may not like it.
+    """
 
     problem: str
     file: str | None = None
     line: int | None = None
     where: str | None = None
+    level: Literal["error", "warning"] | None = None
 
     def as_dict(self) -> dict[str, str | int]:
         """The problem without its empty members, in the contract's words."""
         members = {"file": self.file, "line": self.line, "where": self.where, "problem": self.problem}
+        members |= {"level": self.level}
         return {name: value for name, value in members.items() if value is not None}
 
 

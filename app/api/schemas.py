@@ -265,6 +265,10 @@ class ProblemItem(BaseModel):
     file: str | None = None
     line: int | None = None
     where: str | None = None
+    level: Literal["error", "warning"] | None = Field(
+        default=None,
+        description="Of a finding about a served map: error where its consumer would refuse it, else warning.",
+    )
 
 
 class ProblemOut(BaseModel):

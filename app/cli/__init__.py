@@ -81,6 +81,7 @@ def build(*, all_flags: bool = True) -> typer.Typer:
         ("import", maps.import_maps),
         ("export", maps.export_map),
         ("convert", maps.convert),
+        ("check", maps.check),
         ("formats", maps.list_formats),
         ("coverage", maps.coverage),
         ("versions", history.versions),

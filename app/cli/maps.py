@@ -1,4 +1,4 @@
-"""Maps in and out: import, export, convert, formats, coverage."""
+"""Maps in and out: import, export, convert, check, formats, coverage."""
 
 from __future__ import annotations
 
@@ -154,6 +154,41 @@ def convert(
     for name in names if as_folder else [out] if out != "-" else []:
         output.say(f"wrote {Path(out) / name if as_folder else name}")
     show_report(made.report)
+
+
+def check(
+    paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="Map files, or a folder.", exists=True)],
+    format: options.Format = None,
+    as_json: options.Json = False,
+) -> None:
+    """Tell what the robots and tools that load these files would refuse or not like.
+
+    The rules are those of each format's own loaders (Nav2's map_server, its route server, …); nothing is uploaded or
+    changed. The exit status is 1 where a map would be refused.
+    """
+    from app import bundle, formats
+
+    collected, _, notes = _collect(paths)
+    files = bundle.unpack({f.name: f.path.read_bytes() for f in collected}, formats.Limits())
+    groups, rest = formats.group({name: data for name, data in files.items() if data}, format)
+    told: list[dict[str, Any]] = []
+    for group in groups:
+        found = [p.as_dict() for p in formats.check(group.format, group.files)]
+        level = found[0]["level"] if found else "fine" if group.format.check else "unchecked"
+        told.append({"format": group.format.name, "file": group.main, "result": level, "findings": found})
+    if not told:
+        raise Invalid("none of the files is a map that is known here: name the format with --format")
+    if as_json:
+        output.show_json({"maps": told, "unknown": rest})
+    else:
+        for note in notes:
+            output.say(f"left out: {note}", style="yellow")
+        for line in told:
+            _show_check(line)
+        for name in rest:
+            output.say(f"not checked: {name}: no format reads this file")
+    if any(line["result"] == "error" for line in told):
+        raise typer.Exit(1)
 
 
 def list_formats(as_json: options.Json = False) -> None:
@@ -320,6 +355,20 @@ def _store(got: Download, to: str | None) -> list[str]:
             return []
         write.to_file(target, stream)
     return [str(target)]
+
+
+_RESULTS: Mapping[str, str] = {
+    "fine": "nothing to complain of",
+    "warning": "loads, with doubts",
+    "error": "would be refused",
+    "unchecked": "no rules are known for this format",
+}
+
+
+def _show_check(line: Mapping[str, Any]) -> None:
+    output.show(f"{line['file']} ({line['format']}): {_RESULTS[line['result']]}")
+    for found in line["findings"]:
+        output.show(f"  {found['level']}: {output.place(found)}")
 
 
 def _step(step: Any) -> str:

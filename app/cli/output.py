@@ -120,7 +120,8 @@ def show_warnings(warnings: Sequence[Mapping[str, Any]], *, limit: int = 20) -> 
         names = ", ".join(str(w["file"]) for w in alike[:NAMED]) if len(alike) > 1 else ""
         more = f" and {len(alike) - NAMED} more" if len(alike) > NAMED else ""
         line = f"{len(alike)} files: {alike[0].get('problem')}: {names}{more}" if names else place(alike[0])
-        say(f"warning: {line}", style="yellow")
+        severe = alike[0].get("level") == "error"
+        say(f"{'would be refused' if severe else 'warning'}: {line}", style="red" if severe else "yellow")
     if len(told) > limit:
         say(f"… and {sum(map(len, told[limit:]))} more warnings (--json shows all)", style="yellow")
 

@@ -164,4 +164,6 @@ def not_carried(known: Format, entries: Mapping[PartKey, PartEntry] | None, laye
 
 def warnings_of(report: Mapping[str, Any]) -> list[Problem]:
     """A report's warnings as values."""
-    return [Problem(w["problem"], w.get("file"), w.get("line"), w.get("where")) for w in report["warnings"]]
+    return [
+        Problem(w["problem"], w.get("file"), w.get("line"), w.get("where"), w.get("level")) for w in report["warnings"]
+    ]

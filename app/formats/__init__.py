@@ -14,7 +14,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -146,6 +146,8 @@ class Format:
     version: raise it when the same layers give other bytes (it is part of every ETag). choose: of the parts that it
     carries, those that these options ask for. by_file: the options that a wanted file's name says. outlines: it writes
     where grids lie, not their cells. joined: its main files of one folder are one map (graphs 0.yaml, 1.yaml …).
+    check: the loader rules of the map's consumers, looked at in a map's files (main file first) without our reader
+    or writer; ``app.formats.check`` says what it gives and what it may cost.
     """
 
     name: str
@@ -169,6 +171,7 @@ class Format:
     by_file: Callable[[str], Mapping[str, str]] = lambda name: {}
     outlines: bool = False
     joined: bool = False
+    check: Callable[[Files], Iterable[Problem]] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,7 +321,68 @@ def write(known: Format, layers: Layers, context: WriteContext) -> dict[str, byt
     if context.options is None:
         context.options = known.write_options()
     with _without_collector():
-        return known.write(layers, context)
+        files = known.write(layers, context)
+    context.warnings = _joined(context.warnings, check(known, files))
+    return files
+
+
+LISTED = 50
+"""Findings of each level that a check tells one by one; of further ones it tells the number."""
+
+
+def check(known: Format, files: Files) -> list[Problem]:
+    """What the consumers of a map would refuse (level ``error``) or may not like (``warning``), errors first.
+
+    files: the map's, main file first. This runs on each map that is served, so a format's ``check`` looks at headers
+    and bytes rather than parse a large file slowly. It yields problems from its loader's rules and raises what is
+    natural where the files do not parse at all, which is an error too.
+    """
+    if known.check is None or not files:
+        return []
+    main = next(iter(files))
+    found: dict[str, list[Problem]] = {"error": [], "warning": []}
+    more = {"error": 0, "warning": 0}
+    seen: set[tuple[str | None, str | None, str]] = set()
+    for one in _findings(known, files, main):
+        problem = replace(one, file=one.file or main, level=one.level or "error")
+        told = (problem.file, problem.where, problem.problem)
+        if told in seen:
+            continue
+        if len(found[str(problem.level)]) < LISTED:
+            seen.add(told)
+            found[str(problem.level)].append(problem)
+        else:
+            more[str(problem.level)] += 1
+    for level, problems in found.items():
+        if more[level]:
+            reason = f"and {more[level]} more findings of this level"
+            problems.append(replace(problems[-1], problem=reason, line=None, where=None))
+    return found["error"] + found["warning"]
+
+
+def _findings(known: Format, files: Files, main: str) -> Iterator[Problem]:
+    assert known.check is not None
+    try:
+        yield from known.check(files)
+    except FleetMapError as error:
+        yield from [replace(p, level="error") for p in error.problems] or [Problem(error.detail, main, level="error")]
+    except BAD_INPUT as error:
+        line, reason = _explain(error)
+        yield Problem(f"it cannot be read as {known.title}: {reason}", main, line, level="error")
+
+
+def _joined(said: Sequence[Problem], found: Iterable[Problem]) -> list[Problem]:
+    """A writer's warnings and a check's findings; of two about one place the writer's own words stay, at its level."""
+    places: dict[tuple[str | None, str | None], int] = {(p.file, p.where): k for k, p in enumerate(said) if p.where}
+    texts = {p.problem for p in said}
+    out = list(said)
+    for one in found:
+        k = places.get((one.file, one.where))
+        if k is not None:
+            out[k] = replace(out[k], level="error" if "error" in (one.level, out[k].level) else "warning")
+        elif one.problem not in texts:
+            out.append(one)
+    return out
 
 
 @contextlib.contextmanager

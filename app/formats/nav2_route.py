@@ -29,7 +29,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _json, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _json, _nav2_route_rules, register
 from app.formats._network import (
     AMONG_PARTS,
     Array,
@@ -72,9 +72,6 @@ CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}
 
 CANONICAL_NODE = frozenset({"kind", "name", "action", "speed_limit", "width", NAME}) | AMONG_PARTS
 CANONICAL_EDGE = CANONICAL_NODE | {"source", "target"}
-
-FAR = 16_384.0
-"""Metres. The server keeps coordinates as 32 bit floats: beyond this they step by two millimetres."""
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
@@ -369,10 +366,6 @@ class _Writer:
         apart = len(net.nodes) + len(net.edges) <= MAX_USED_ID // 2
         nodes = _numbered(net.nodes, nodes, own_nodes | own_edges if apart else own_nodes)
         edges = _numbered(net.edges, edges, {*own_edges, *nodes.values()} if apart else own_edges)
-        for what, found, use in (("nodes", nodes, "ComputeRoute's goals"), ("edges", edges, "DynamicEdges")):
-            beyond = sum(n > MAX_USED_ID for n in found.values())
-            if beyond:
-                context.warn(f"{beyond} {what} have ids beyond {MAX_USED_ID}, which {use} cannot name")
         again = sum(_claim(n) not in (None, nodes[k]) for k, n in enumerate(net.nodes))
         again += sum(_claim(e) not in (None, edges[k]) for k, e in enumerate(net.edges))
         if again:
@@ -383,8 +376,6 @@ class _Writer:
         """The whole text, one line for each feature."""
         net, context = self.net, self.context
         at = np.array([(n.x, n.y, 0.0 if n.z is None else n.z) for n in net.nodes], np.float64)
-        if (np.abs(at[:, :2]) > FAR).any():
-            context.warn(f"coordinates beyond {FAR:g} m: the route server keeps them as 32 bit floats, 2 mm apart")
         places = (np.round(at, METRES) + 0.0).tolist()
         rows = [
             self._feature(node, n, {"type": "Point", "coordinates": place if place[2] else place[:2]}, {})
@@ -541,6 +532,7 @@ register(
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
         family=NAME,
+        check=_nav2_route_rules.check,
         rank=36,
         extensions=(".geojson", ".json"),
     )

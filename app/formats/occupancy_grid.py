@@ -21,7 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import BadUpload, FleetMapError, Invalid, Problem, UnreadableFile
-from app.formats import BAD_INPUT, Files, Format, Limits, Needs, ReadContext, WriteContext, _image, _yaml, register
+from app.formats import (
+    BAD_INPUT,
+    Files,
+    Format,
+    Limits,
+    Needs,
+    ReadContext,
+    WriteContext,
+    _image,
+    _occupancy_grid_rules,
+    _yaml,
+    register,
+)
 from app.formats._choice import the_one
 from app.model.frame import MAX_METRES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, Mode, OccupancyGrid, outline
@@ -34,9 +46,6 @@ KEYS = ("image", "mode", "resolution", "origin", "negate", "occupied_thresh", "f
 REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 YAML_ENDS = (".yaml", ".yml")
 IMAGE_ENDS = (".pgm", ".png", ".bmp", ".jpg", ".jpeg")
-
-NAV2_CELLS = 32767
-"""Nav2 refuses grids wider or higher than this (validate_messages.hpp)."""
 
 SAVED = {FREE: 254, OCCUPIED: 0, UNKNOWN: 205}
 """The pixels that map_saver writes."""
@@ -339,9 +348,6 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     # A second character ":" would make a Windows drive of it, which no archive may hold.
     stem = re.sub(r"[/\\\x00-\x1f]|(?<=^.):", "_", key.name.lstrip(".")) or MAP
     grid, pixels, kind = _encoding(grid, options, context, stem + ".yaml")
-    if max(grid.width, grid.height) > NAV2_CELLS:
-        reason = f"the grid has {grid.width} × {grid.height} cells; Nav2 takes at most {NAV2_CELLS} each way"
-        context.warn(reason, file=stem + ".yaml")
     if grid.origin[2] != 0.0:
         reason = f"the origin is turned by {grid.origin[2]:g} rad; Nav2 ignores that: ask for normalize=true"
         context.warn(reason, file=stem + ".yaml", where="origin")
@@ -614,6 +620,7 @@ register(
         write_options=WriteOptions,
         choose=choose,
         by_file=by_file,
+        check=_occupancy_grid_rules.check,
         rank=40,
         extensions=(*YAML_ENDS, *IMAGE_ENDS),
     )

@@ -182,7 +182,7 @@ def test_the_sample_in_full(same: Same) -> None:
     served, told = write(part)
     assert same("nav2_route", {"a.geojson": data}, {"b.geojson": served}) == []
     assert told.dropped == told.template == []
-    assert "1 nodes have ids beyond 65535" in warnings(told)
+    assert "1 nodes have an id above 65535" in warnings(told)
     server = RouteServer(served)
     assert server.edges[1] == (1, 0)
     assert b'"speed_limit":85.0' in served
