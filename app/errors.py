@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class FleetMapError(Exception):
         self.detail = detail
         self.problems = tuple(problems)
 
-    def __reduce__(self) -> tuple[type[FleetMapError], tuple[str, tuple[Problem, ...]]]:
+    def __reduce__(self) -> tuple[type[FleetMapError], tuple[Any, ...]]:
         return type(self), (self.detail, self.problems)
 
 
@@ -73,6 +73,17 @@ class UnsafeArchive(BadUpload):
 
 class CannotConvert(FleetMapError):
     """The stored layers do not give the wanted map; ``detail`` says what to supply."""
+
+
+class CannotDerive(CannotConvert):
+    """A derivation found nothing in the stored content that it can use; ``step`` is its name."""
+
+    def __init__(self, detail: str, problems: Sequence[Problem] = (), step: str = "") -> None:
+        super().__init__(detail, problems)
+        self.step = step
+
+    def __reduce__(self) -> tuple[type[FleetMapError], tuple[Any, ...]]:
+        return type(self), (self.detail, self.problems, self.step)
 
 
 class MissingLayer(CannotConvert):

@@ -35,7 +35,7 @@ from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut,
 from app.api.services import Here, Services
 from app.convert import Recipe
 from app.convert.cache import Made, MadeFile
-from app.errors import Invalid, NotFound, Problem
+from app.errors import CannotDerive, Invalid, NotFound, Problem
 from app.store.values import LATEST, Version
 
 FRESH_SECONDS = 1.0
@@ -107,24 +107,29 @@ class Hot:
         values, derive = _options(key[1])
         # Taken before anything is read: a commit in between makes this answer stale, never fresh.
         generation, until = self.generation(), time.monotonic() + FRESH_SECONDS
-        recipe = await self._recipe(key, here, wanted, values, derive)
-        old = self._entries.get(key)
-        if old is not None and _same(old.recipe, recipe) and old.body is not None:
-            fresh = replace(old, generation=generation, fresh_until=until)
-            self._put(key, fresh)
-            return fresh
-        empty = self._resource(wanted, recipe, values, derive, generation, until, _route(request))
-        if _matches(request, empty.etag):
-            self._put(key, empty)
-            return empty
-        made = await run_in_threadpool(here.maps.ready, recipe)
-        if made is not None:
-            self._metrics.disk_hits.inc()
-        else:
-            outcome = await here.work.make(recipe, who, address_of(request))
+        while True:
+            recipe = await self._recipe(key, here, wanted, values, derive)
+            old = self._entries.get(key)
+            if old is not None and _same(old.recipe, recipe) and old.body is not None:
+                fresh = replace(old, generation=generation, fresh_until=until)
+                self._put(key, fresh)
+                return fresh
+            empty = self._resource(wanted, recipe, values, derive, generation, until, _route(request))
+            if _matches(request, empty.etag):
+                self._put(key, empty)
+                return empty
+            made = await run_in_threadpool(here.maps.ready, recipe)
+            if made is not None:
+                self._metrics.disk_hits.inc()
+                break
+            try:
+                outcome = await here.work.make(recipe, who, address_of(request))
+            except CannotDerive:
+                continue  # it is remembered: the next recipe goes another way, or says that there is none
             if isinstance(outcome, Started):
                 return outcome
             made = outcome
+            break
         full = await run_in_threadpool(_filled, empty, made)
         self._put(key, full)
         return full
@@ -462,9 +467,15 @@ async def report(
     """Raw, derived and filled-in information of a map, what was dropped and why. Takes the map's own parameters."""
     values, allowed = _options(request.scope["query_string"])
     wanted = Wanted(env, v, format, None)
-    recipe = await run_in_threadpool(_resolve, here, wanted, values, allowed and derive)
-    if await run_in_threadpool(here.maps.ready, recipe) is None:
-        outcome = await here.work.make(recipe, who, address_of(request))
+    while True:
+        recipe = await run_in_threadpool(_resolve, here, wanted, values, allowed and derive)
+        if await run_in_threadpool(here.maps.ready, recipe) is not None:
+            break
+        try:
+            outcome = await here.work.make(recipe, who, address_of(request))
+        except CannotDerive:
+            continue
         if isinstance(outcome, Started):
             return started(outcome.job)
+        break
     return answer(await run_in_threadpool(here.maps.report, recipe))

@@ -16,6 +16,7 @@ from app.api.access import AtLeast, is_open
 from app.api.answers import API
 from app.api.problems import MEDIA_TYPE
 from app.api.schemas import ProblemOut, RevertBody, told
+from app.derive import all_derivations
 from app.errors import NotFound
 
 ASSETS = {
@@ -215,13 +216,16 @@ def _path_parameter(name: str) -> dict[str, Any]:
 
 
 def _query_parameters() -> list[dict[str, Any]]:
-    """``derive``, and the options of all formats; one that several have is told once, with what it means for each."""
+    """``derive``, the options of all formats, and the parameters of the derivations on the way to them.
+
+    One that several have is told once, with what it means for each.
+    """
     out: dict[str, dict[str, Any]] = {}
-    for known in formats.all_formats().values():
-        if not known.write:
-            continue
-        for option in parameters.describe(known.write_options):
-            text = f"`{known.name}`: {option['description']} Default: {option['default']!r}."
+    declared = [(known.name, known.write_options) for known in formats.all_formats().values() if known.write]
+    declared += [(step.name, step.parameters) for step in all_derivations().values()]
+    for name, options in declared:
+        for option in parameters.describe(options):
+            text = f"`{name}`: {option['description']} Default: {option['default']!r}."
             entry = out.setdefault(
                 option["name"],
                 {"name": option["name"], "in": "query", "description": "", "schema": dict(option["schema"])},

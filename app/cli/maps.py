@@ -127,16 +127,18 @@ def convert(
     """Convert files on this machine: no server, nothing stored.
 
     A map of several files becomes a folder, or a ZIP where the output's name ends in .zip. Options are the wanted
-    format's; those it does not know go to the readers.
+    format's, or a derivation's on the way; those that neither knows go to the readers.
     """
     from app import formats, parameters
     from app.bundle import Hints
     from app.convert import offline
+    from app.derive import all_derivations, takes
 
     if out == "-" and as_json:
         raise typer.BadParameter("--json and -o - both want standard output")
     known = formats.get_format(to)
     ours = {p["name"] for p in parameters.describe(known.write_options)}
+    ours |= {name for step in all_derivations() for name in takes(step)}
     values = options.pairs(option)
     files, _, notes = _collect(paths)
     hints = Hints(format, _layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})

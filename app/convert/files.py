@@ -11,8 +11,8 @@ from app import bundle, formats
 from app.bundle import Hints, Known
 from app.convert import make as making
 from app.convert import recipe as recipes
-from app.errors import MissingLayer, Problem
-from app.formats import Files, Limits
+from app.errors import CannotDerive, Invalid, MissingLayer, Problem
+from app.formats import Files, Format, Limits
 from app.model.features import Features
 from app.model.frame import Datum
 from app.model.layers import Layer, Layers, PartKey
@@ -37,32 +37,52 @@ def offline(
     derived: bool = True,
     limits: Limits | None = None,
 ) -> Converted:
-    """Read files, derive what the wanted format lacks, write it. ``options`` are the wanted format's own.
+    """Read files, derive what the wanted format lacks, write it.
+
+    options: the wanted format's own, and the parameters of derivations on the way.
 
     Raises what reading and planning raise; see ``app.bundle.read`` and ``app.convert.recipe.chain``.
     """
     known = formats.get_format(to)
-    write_options = formats.write_options(known, options or {})
+    asked = dict(options or {})
+    recipes.own_options(known, asked)
     limits = limits or Limits()
     unpacked = bundle.unpack(files, limits)
     hints = hints or Hints()
     needed: frozenset[Layer] = known.needs.also.union(*known.needs.one_of)
     wanted = None if "objects" in needed else needed  # whatever can be read can be an object
-    told = bundle.read(unpacked, hints, Known(datum, None, wanted, not known.outlines, known.drawing), limits)
-    layers = told.layers(datum)
-    try:
-        way = recipes.chain(known, _stock(layers), write_options, derived=derived)
-    except MissingLayer:
-        if wanted is None:
-            raise
-        # What the format carries is not in the files: read all they have, to derive it from.
-        told = bundle.read(unpacked, hints, Known(datum, None, None, not known.outlines, known.drawing), limits)
-        layers = told.layers(datum)
-        way = recipes.chain(known, _stock(layers), write_options, derived=derived)
-    kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
-    written = making.write(known, kept, options or {}, way, origin=told.origin)
+    while True:
+        told = bundle.read(unpacked, hints, Known(datum, None, wanted, not known.outlines, known.drawing), limits)
+        try:
+            written = _made(known, told, datum, asked, derived=derived)
+            break
+        except (MissingLayer, Invalid):
+            if wanted is None:
+                raise
+            wanted = None  # what the format carries is not in the files: read all they have, to derive it from
     report = {**written.report, "warnings": [p.as_dict() for p in told.warnings] + written.report["warnings"]}
     return Converted(written.files, report, told.warnings)
+
+
+def _made(
+    known: Format, told: bundle.Bundle, datum: Datum | None, asked: Mapping[str, Any], *, derived: bool
+) -> making.Written:
+    """By the cheapest way that works on these layers."""
+    layers = told.layers(datum)
+    own = recipes.own_options(known, asked)
+    without: frozenset[str] = frozenset()
+    failed: list[str] = []
+    while True:
+        try:
+            way = recipes.chain(known, _stock(layers), own, derived=derived, values=asked, without=without)
+        except MissingLayer as error:
+            raise recipes.exhausted(error, failed) from error
+        kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
+        try:
+            return making.write(known, kept, asked, way, origin=told.origin)
+        except CannotDerive as error:
+            without |= {error.step}
+            failed.append(error.detail)
 
 
 def offline_paths(

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from app import derive, formats
+from app.convert import recipe as recipes
 from app.convert.recipe import Chain
-from app.errors import FleetMapError, Problem
+from app.derive import Step
+from app.errors import CannotDerive, FleetMapError, Problem
 from app.formats import Format, WriteContext, _archive
 from app.model.features import Features
 from app.model.frame import GROUND
-from app.model.layers import LAYERS, VECTOR_LAYERS, Layers, PartKey
+from app.model.layers import LAYERS, VECTOR_LAYERS, Layer, Layers, PartKey
 from app.store import Store
 from app.store.values import PartEntry, Version
 
@@ -46,13 +48,15 @@ def make(
     return write(known, layers, values, way, entries)
 
 
-def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) -> str | None:
-    """In a worker: why the derivations of a chain fail on a version's content, or None where they work."""
+def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) -> tuple[str, str] | None:
+    """In a worker: the step of a chain that fails on a version's content and why, or None where all work."""
     loaded = open_store(database_url, blob_dir).load(version, way.keys)
     try:
         derive.run(way.steps, Layers(loaded.parts, version.datum, version.levels))
+    except CannotDerive as error:
+        return error.step, error.detail
     except FleetMapError as error:
-        return error.detail
+        return "", error.detail
     return None
 
 
@@ -65,19 +69,21 @@ def write(
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None = None,
 ) -> Written:
     """Derive and write. ``entries`` (of a stored version) or ``origin`` (of files) say where each part came from."""
-    made = derive.run(way.steps, layers)
-    used = Layers({k: p for k, p in made.parts.items() if k.layer in known.carries}, made.datum, made.levels)
-    context = WriteContext(options=formats.write_options(known, values))
+    notes = derive.Notes()
+    made = derive.run(way.steps, layers, notes)
+    context = WriteContext(options=recipes.own_options(known, values))
+    chosen = known.choose(sorted(k for k in made.parts if k.layer in known.carries), context.options)
+    used = Layers({k: made.parts[k] for k in chosen}, made.datum, made.levels)
     files = formats.write(known, used, context)
     lines = _told(used, layers, way, entries or {}, origin or {})
     report = {
         "format": known.name,
         "layers": lines,
         "attribution": credits_of(lines),
-        "template": context.template,
+        "template": notes.template + context.template,
         # What a stored version holds beside this map is not part of the recipe's key: ``Maps.report`` adds it.
-        "dropped": context.dropped + (not_carried(known, None, layers) if entries is None else []),
-        "warnings": [p.as_dict() for p in context.warnings],
+        "dropped": notes.dropped + context.dropped + (not_carried(known, None, layers) if entries is None else []),
+        "warnings": [p.as_dict() for p in notes.warnings + context.warnings],
     }
     return Written(files, report)
 
@@ -112,12 +118,13 @@ def _told(
             continue
         line: dict[str, Any] = {"layer": key.layer, "level": key.level, "name": key.name}
         if key not in before.parts and key.layer in steps:
-            step = steps[key.layer]
-            sources = sorted({s for k, e in entries.items() if k.layer in step.needs for s in e.provenance.sources})
-            sources = sources or sorted({s for k, (n, _) in origin.items() if k.layer in step.needs for s in n})
-            needed = [k for k in before.parts if k.layer in step.needs]
+            way_here, roots = _ancestry(key.layer, steps)
+            sources = sorted({s for k, e in entries.items() if k.layer in roots for s in e.provenance.sources})
+            sources = sources or sorted({s for k, (n, _) in origin.items() if k.layer in roots for s in n})
+            needed = [k for k in before.parts if k.layer in roots]
             credit = list(dict.fromkeys(text for k in needed for text in _credit(k, before, entries)))
-            line |= {"information": "derived", "steps": [step.name], "sources": sources, "attribution": credit}
+            done = [step.as_dict() for step in way.steps if step in way_here]
+            line |= {"information": "derived", "steps": done, "sources": sources, "attribution": credit}
         elif key in entries:
             p = entries[key].provenance
             line |= {"information": p.information, "steps": [dict(s) for s in p.steps], "sources": list(p.sources)}
@@ -130,6 +137,21 @@ def _told(
         site = {"layer": "location", "level": GROUND, "name": "datum", "information": "raw"}
         out.insert(0, {**site, "steps": [], "sources": [], "attribution": []})
     return out
+
+
+def _ancestry(layer: Layer, steps: Mapping[Layer, Step]) -> tuple[set[Step], set[Layer]]:
+    """The steps that lead to a derived layer, and the stored layers they start from."""
+    done: set[Step] = set()
+    roots: set[Layer] = set()
+    todo = [layer]
+    while todo:
+        step = steps.get(todo.pop())
+        if step is None or step in done:
+            continue
+        done.add(step)
+        todo += [need for need in step.needs if need in steps]
+        roots |= {need for need in step.needs if need not in steps}
+    return done, roots
 
 
 def _credit(key: PartKey, layers: Layers, entries: Mapping[PartKey, PartEntry]) -> list[str]:

@@ -14,7 +14,15 @@ from app.convert import make as making
 from app.convert import recipe as recipes
 from app.convert.cache import Cache, Made, Product
 from app.convert.recipe import Recipe
-from app.errors import Ambiguous, CannotConvert, FleetMapError, UnreadableFile
+from app.errors import (
+    Ambiguous,
+    CannotConvert,
+    CannotDerive,
+    FleetMapError,
+    MissingLayer,
+    Problem,
+    UnreadableFile,
+)
 from app.formats import Limits
 from app.model.frame import Datum
 from app.model.layers import Layers
@@ -38,7 +46,7 @@ class Maps:
     ) -> None:
         self._store, self._run, self._limits = store, run, limits
         self.cache = Cache(cache_dir, cache_bytes)
-        self._tried: dict[Any, str | None] = {}
+        self._tried: dict[Any, tuple[str, str] | None] = {}
         self._guard = threading.Lock()
 
     def recipe(
@@ -55,15 +63,34 @@ class Maps:
         file: the one file of the map that is wanted; its name may say more (``keepout.yaml`` is the grid keepout).
         """
         said = formats.get_format(name).by_file(file) if file else {}
-        return recipes.recipe(version, name, {**said, **(values or {})}, derived=derive)
+        asked = {**said, **(values or {})}
+        without: frozenset[str] = frozenset()
+        failed: list[str] = []
+        while True:
+            try:
+                found = recipes.recipe(version, name, asked, derived=derive, without=without)
+            except MissingLayer as error:
+                raise recipes.exhausted(error, failed) from error
+            known = self._tried.get(_content(version, found.chain)) if found.steps else None
+            if known is None or not known[0]:
+                return found
+            without |= {known[0]}
+            failed.append(known[1])
 
     def ready(self, recipe: Recipe) -> Made | None:
         """The map, only if it is made already."""
         return self.cache.get(recipe.key)
 
     def make(self, recipe: Recipe) -> Made:
-        """The map; blocks until it is made."""
-        return self.cache.get_or_make(recipe.key, lambda: self._made(recipe))
+        """The map; blocks until it is made.
+
+        CannotDerive where a step finds nothing to use: then ``recipe`` gives another way, if there is one.
+        """
+        try:
+            return self.cache.get_or_make(recipe.key, lambda: self._made(recipe))
+        except CannotDerive as error:
+            self._remember(_content(recipe.version, recipe.chain), (error.step, error.detail))
+            raise
 
     def report(self, recipe: Recipe) -> dict[str, Any]:
         """What was raw, derived, filled in and dropped: the contract's report, for this version."""
@@ -95,38 +122,56 @@ class Maps:
                 continue
             line: dict[str, Any] = {"format": known.name, "state": "missing", "chain": [], "missing": []}
             try:
-                way = recipes.chain(known, available, known.write_options())
+                way = self._way(version, known, available)
             except Ambiguous as error:  # it can be made, once the caller says which one
                 line |= {"state": "direct", "choose": error.detail}
             except FleetMapError as error:
-                line["missing"] = recipes.missing(known, available) or [error.detail]
+                line["missing"] = [*recipes.missing(known, available), *(p.problem for p in error.problems)]
+                line["missing"] = line["missing"] or [error.detail]
             else:
-                hindrance = self._hindrance(version, way) if way.steps else None
-                if hindrance is None:
-                    line["state"] = "derivable" if way.steps else "direct"
-                    line["chain"] = [_step(step) for step in way.steps]
-                else:
-                    line["missing"] = [*recipes.missing(known, available), hindrance]
+                line["state"] = "derivable" if way.steps else "direct"
+                line["chain"] = [step.as_dict() for step in way.steps]
             out.append(line)
         return out
 
-    def _hindrance(self, version: Version, way: recipes.Chain) -> str | None:
-        """Why a derivation would not work on what is stored, found by doing it once for each content."""
-        entries = {e.key: e.hash for e in version.parts}
-        key = (way.steps, version.datum, tuple((k, entries[k]) for k in way.keys))
+    def _way(self, version: Version, known: formats.Format, available: recipes.Stock) -> recipes.Chain:
+        """The cheapest chain whose derivations work on what is stored, found by doing them once for each content."""
+        without: frozenset[str] = frozenset()
+        failed: list[str] = []
+        while True:
+            try:
+                way = recipes.chain(known, available, known.write_options(), without=without)
+            except MissingLayer as error:
+                raise MissingLayer(error.detail, [Problem(reason) for reason in failed]) from error
+            hindrance = self._hindrance(version, way) if way.steps else None
+            if hindrance is None:
+                return way
+            step, reason = hindrance
+            failed.append(reason)
+            if not step:
+                raise CannotConvert(reason, [Problem(reason) for reason in failed])
+            without |= {step}
+
+    def _hindrance(self, version: Version, way: recipes.Chain) -> tuple[str, str] | None:
+        """The step of a chain that would not work on what is stored and why (no step: none is to blame)."""
+        way = recipes.needed(way)
+        key = _content(version, way)
         with self._guard:
             if key in self._tried:
                 return self._tried[key]
         where = (self._store.database_url, str(self._store.blob_dir))
         try:
-            found: str | None = self._run(making.hindrance, *where, version, way)
+            found: tuple[str, str] | None = self._run(making.hindrance, *where, version, way)
         except WorkerDied as error:
-            found = error.detail
+            found = ("", error.detail)
+        self._remember(key, found)
+        return found
+
+    def _remember(self, key: Any, found: tuple[str, str] | None) -> None:
         with self._guard:
             self._tried[key] = found
             while len(self._tried) > TRIED:
                 self._tried.pop(next(iter(self._tried)))
-        return found
 
     def convert(
         self,
@@ -138,7 +183,7 @@ class Maps:
         options: Mapping[str, str] | None = None,
     ) -> direct.Converted:
         """Convert spooled files without storing anything."""
-        formats.write_options(formats.get_format(to), options or {})
+        recipes.own_options(formats.get_format(to), options or {})
         arguments = (dict(files), to, hints or Hints(), datum, dict(options or {}), self._limits)
         try:
             converted: direct.Converted = self._run(direct.offline_paths, *arguments)
@@ -162,9 +207,7 @@ class Maps:
         return Product(typed, archive, written.report)
 
 
-def _step(step: Any) -> dict[str, Any]:
-    from app.derive import all_derivations
-
-    known = all_derivations()[step.name]
-    values = {p["name"]: p["default"] for p in parameters.describe(known.parameters)}
-    return {"step": step.name, "from": list(step.needs), "to": step.gives, "parameters": values}
+def _content(version: Version, way: recipes.Chain) -> Any:
+    """What the outcome of a chain's derivations depends on."""
+    entries = {e.key: e.hash for e in version.parts}
+    return way.steps, version.datum, tuple((k, entries[k]) for k in recipes.needed(way).keys)

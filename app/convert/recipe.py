@@ -6,8 +6,9 @@ writer's version), so an equal key means equal bytes: it is the cache's key and 
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,7 +16,7 @@ import orjson
 
 from app import __version__, derive, formats, parameters
 from app.derive import Step
-from app.errors import MissingDatum, MissingLayer
+from app.errors import Invalid, MissingDatum, MissingLayer, Problem
 from app.formats import Format
 from app.model.layers import LAYERS, Layer, PartKey
 from app.store.values import PartEntry, Version
@@ -94,25 +95,90 @@ def stock(version: Version) -> Stock:
     return Stock(frozenset(e.key for e in entries), version.datum is not None, anchors, blank)
 
 
-def chain(known: Format, available: Stock, options: Any, *, derived: bool = True) -> Chain:
-    """The cheapest way to a format. MissingLayer or MissingDatum say what to supply; Ambiguous names the choices."""
+def chain(
+    known: Format,
+    available: Stock,
+    options: Any,
+    *,
+    derived: bool = True,
+    values: Mapping[str, str] | None = None,
+    without: frozenset[str] = frozenset(),
+) -> Chain:
+    """The cheapest way to a format. MissingLayer or MissingDatum say what to supply; Ambiguous names the choices.
+
+    values: what was asked for, by name; what is no option of the format is a parameter of a step on the way. Where no
+    step of the cheapest way has it, the layer is made anew by a step that has (a slice of a world beside a stored
+    grid). without: derivations that are known to find nothing to use.
+    """
+    asked = dict(values or {})
     available = available.seen_by(known)
     if known.needs.datum and not available.datum:
         raise MissingDatum(f"{known.name} needs {SUPPLY['location']}")
-    best: derive.Plan | None = None
-    for wanted in known.needs.one_of:
-        found = derive.plan(available.layers, wanted)
-        if found is not None and (derived or not found.steps) and (best is None or found.cost < best.cost):
-            best = found
+    best = _best(known, available, without, derived=derived)
+    rest = asked.keys() - {f.name for f in dataclasses.fields(known.write_options)}
+    if rest and (best is None or not rest <= _taken(best)):
+        available, best = _forced(known, available, without, frozenset(rest), derived=derived)
     if best is None:
         raise MissingLayer(f"{known.name} cannot be made: supply {' or '.join(missing(known, available))}")
     carried = known.carries | {layer for step in best.steps for layer in step.needs}
     keys = sorted(k for k in available.keys if k.layer in carried)
-    chosen = known.choose([k for k in keys if k.layer in known.carries], options)
+    chosen: Sequence[PartKey] = [k for k in keys if k.layer in known.carries]
+    if not any(step.gives in known.carries for step in best.steps):  # else it is chosen once all parts are there
+        chosen = known.choose(chosen, options)
     needed = {layer for step in best.steps for layer in step.needs}
     keys = sorted({*chosen, *(k for k in keys if k.layer in needed)})
     _check_anchor(known, available, keys)
-    return Chain(best.steps, tuple(keys))
+    return Chain(derive.with_values(best.steps, asked), tuple(keys))
+
+
+def _best(known: Format, available: Stock, without: frozenset[str], *, derived: bool = True) -> derive.Plan | None:
+    best: derive.Plan | None = None
+    for wanted in known.needs.one_of:
+        found = derive.plan(available.layers, wanted, without)
+        if found is not None and (derived or not found.steps) and (best is None or found.cost < best.cost):
+            best = found
+    return best
+
+
+def _taken(way: derive.Plan) -> frozenset[str]:
+    """The names of all parameters on a way."""
+    return frozenset().union(*(derive.takes(step.name) for step in way.steps))
+
+
+def _forced(
+    known: Format, available: Stock, without: frozenset[str], names: frozenset[str], *, derived: bool
+) -> tuple[Stock, derive.Plan]:
+    """A way with a step that knows all these parameters, and the stock without what that step makes anew."""
+    useful = frozenset().union(*known.needs.one_of)
+    everything = derive.all_derivations()
+    found: list[tuple[float, str, Stock, derive.Plan]] = []
+    for name, step in everything.items() if derived else ():
+        if not names <= derive.takes(name) or step.gives not in useful or name in without:
+            continue
+        less = replace(available, keys=frozenset(k for k in available.keys if k.layer != step.gives))
+        rivals = frozenset(n for n, d in everything.items() if d.gives == step.gives and n != name)
+        way = _best(known, less, without | rivals)
+        if way is not None and any(s.name == name for s in way.steps):
+            found.append((way.cost, name, less, way))
+    if found:
+        _, _, less, way = min(found, key=lambda f: f[:2])
+        return less, way
+    if any(names <= derive.takes(name) for name in without):
+        lacking = " or ".join(missing(known, available)) or "other layers"
+        raise MissingLayer(f"{known.name} cannot be made with {', '.join(sorted(names))}: supply {lacking}")
+    told = sorted({n for d, step in everything.items() if step.gives in useful for n in derive.takes(d)})
+    own = [p["name"] for p in parameters.describe(known.write_options)]
+    accepted = ", ".join(own) or "none"
+    further = f"; where a layer is derived, also {', '.join(told)}" if told else ""
+    problem = f"no such parameter of {known.name} here; accepted: {accepted}{further}"
+    wrong = sorted(names)
+    raise Invalid(f"{', '.join(wrong)}: {problem}", [Problem(problem, where=name) for name in wrong])
+
+
+def needed(way: Chain) -> Chain:
+    """The same with only those parts that its steps read."""
+    read = {layer for step in way.steps for layer in step.needs}
+    return replace(way, keys=tuple(k for k in way.keys if k.layer in read))
 
 
 def missing(known: Format, available: Stock) -> list[str]:
@@ -124,13 +190,37 @@ def missing(known: Format, available: Stock) -> list[str]:
     return [text for text in dict.fromkeys(out) if text]
 
 
-def recipe(version: Version, name: str, values: Mapping[str, str], *, derived: bool = True) -> Recipe:
-    """The recipe of a version's map. NotFound, Invalid, MissingLayer, MissingDatum or Ambiguous if there is none."""
+def exhausted(error: MissingLayer, failed: Sequence[str]) -> MissingLayer:
+    """Nothing is left to try: what to supply, and why the derivations that were tried found nothing."""
+    if not failed:
+        return error
+    return MissingLayer(f"{error.detail}; what is stored does not do: {'; '.join(failed)}", error.problems)
+
+
+def recipe(
+    version: Version,
+    name: str,
+    values: Mapping[str, str],
+    *,
+    derived: bool = True,
+    without: frozenset[str] = frozenset(),
+) -> Recipe:
+    """The recipe of a version's map. NotFound, Invalid, MissingLayer, MissingDatum or Ambiguous if there is none.
+
+    values: the format's options and the parameters of derivations on the way, as texts. without: see ``chain``.
+    """
     known = formats.get_format(name)
-    options = formats.write_options(known, values)
-    way = chain(known, stock(version), options, derived=derived)
+    options = own_options(known, values)
+    way = chain(known, stock(version), options, derived=derived, values=values, without=without)
     entries = {e.key: e for e in version.parts}
     return Recipe(version, known, options, way, _key(version, known, options, way, entries))
+
+
+def own_options(known: Format, values: Mapping[str, str]) -> Any:
+    """The format's own options among what was asked for; Invalid for a name that nothing on any way could mean."""
+    own = {f.name for f in dataclasses.fields(known.write_options)}
+    steps = frozenset().union(*(derive.takes(name) for name in derive.all_derivations()))
+    return formats.write_options(known, {n: v for n, v in values.items() if n in own or n not in steps})
 
 
 def _key(version: Version, known: Format, options: Any, way: Chain, entries: Mapping[PartKey, PartEntry]) -> str:
@@ -138,7 +228,7 @@ def _key(version: Version, known: Format, options: Any, way: Chain, entries: Map
         "server": __version__,
         "format": [known.name, known.version],
         "options": parameters.canonical(options),
-        "steps": [[s.name, s.version] for s in way.steps],
+        "steps": [[s.name, s.version, s.given] for s in way.steps],
         "parts": [[k.layer, k.level, k.name, entries[k].hash] for k in way.keys],
         "datum": version.datum.as_dict() if version.datum else None,
         "levels": [[level.name, level.elevation] for level in version.levels],

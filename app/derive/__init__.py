@@ -7,17 +7,44 @@ and when stuck says what to supply.
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
+from app import parameters
+from app.errors import CannotConvert, CannotDerive, Problem
 from app.model.layers import Layer, Layers
 
-Function = Callable[[Layers, Any], Layers]
+
+@dataclass(slots=True)
+class Notes:
+    """Where a step says what was doubtful, what it left out, and what it made up (it goes into the map's report)."""
+
+    warnings: list[Problem] = field(default_factory=list)
+    dropped: list[dict[str, Any]] = field(default_factory=list)
+    template: list[dict[str, Any]] = field(default_factory=list)
+
+    def warn(self, problem: str, *, where: str | None = None) -> None:
+        """The layer was made, but whoever uses it should know this."""
+        self.warnings.append(Problem(problem, where=where))
+
+    def drop(self, what: str, count: int, why: str) -> None:
+        """This much of the source had no part in the result."""
+        if count:
+            self.dropped.append({"what": what, "count": count, "why": why})
+
+    def fill(self, what: str, value: Any, why: str) -> None:
+        """No source says this: a default was taken."""
+        self.template.append({"what": what, "value": value, "why": why})
+
+
+Function = Callable[[Layers, Any, Notes], Layers]
+"""(stored and derived layers, parameters, notes) -> the new parts. Pure but for the notes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +63,19 @@ class Derivation:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A derivation as it stands in a plan."""
+    """A derivation as it stands in a plan. given: its parameters that differ from the defaults, sorted by name."""
 
     name: str
     gives: Layer
     needs: tuple[Layer, ...]
     version: int
+    given: tuple[tuple[str, Any], ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """The step in the contract's words, with all its parameters."""
+        defaults = {p["name"]: p["default"] for p in parameters.describe(all_derivations()[self.name].parameters)}
+        values = {**defaults, **dict(self.given)}
+        return {"step": self.name, "from": list(self.needs), "to": self.gives, "parameters": values}
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +118,11 @@ def all_derivations() -> Mapping[str, Derivation]:
     return dict(sorted(_registry.items()))
 
 
-def plan(available: frozenset[Layer], wanted: frozenset[Layer]) -> Plan | None:
-    """The cheapest chain that adds what is wanted to what is available (Dijkstra over sets of layers), or None."""
+def plan(available: frozenset[Layer], wanted: frozenset[Layer], without: frozenset[str] = frozenset()) -> Plan | None:
+    """The cheapest chain that adds what is wanted to what is available (Dijkstra over sets of layers), or None.
+
+    without: names of derivations that must not be part of it.
+    """
     queue: list[tuple[float, int, frozenset[Layer], tuple[Step, ...]]] = [(0.0, 0, available, ())]
     done: set[frozenset[Layer]] = set()
     pushed = 0
@@ -97,17 +134,36 @@ def plan(available: frozenset[Layer], wanted: frozenset[Layer]) -> Plan | None:
             continue
         done.add(have)
         for d in all_derivations().values():
-            if d.needs <= have and d.gives not in have:
+            if d.needs <= have and d.gives not in have and d.name not in without:
                 pushed += 1
                 step = Step(d.name, d.gives, tuple(sorted(d.needs)), d.version)
                 heapq.heappush(queue, (cost + d.cost, pushed, have | {d.gives}, (*steps, step)))
     return None
 
 
-def run(steps: tuple[Step, ...], layers: Layers, values: Mapping[str, Any] | None = None) -> Layers:
-    """Carry out a plan: the layers with what each step adds. values: parameters by derivation name."""
+def takes(name: str) -> frozenset[str]:
+    """The names of a derivation's parameters."""
+    return frozenset(f.name for f in dataclasses.fields(all_derivations()[name].parameters))
+
+
+def with_values(steps: Iterable[Step], values: Mapping[str, Any]) -> tuple[Step, ...]:
+    """The steps, each with those of the values that it knows. Invalid names what is wrong with one."""
+    out = []
+    for step in steps:
+        own = {name: value for name, value in values.items() if name in takes(step.name)}
+        chosen = parameters.parse(all_derivations()[step.name].parameters, own, f"parameter of {step.name}")
+        out.append(replace(step, given=tuple(parameters.canonical(chosen).items())))
+    return tuple(out)
+
+
+def run(steps: Iterable[Step], layers: Layers, notes: Notes | None = None) -> Layers:
+    """Carry out a plan: the layers with what each step adds. CannotDerive names the step that found nothing to use."""
+    notes = notes or Notes()
     for step in steps:
         known = all_derivations()[step.name]
-        made = known.function(layers, (values or {}).get(step.name) or known.parameters())
+        try:
+            made = known.function(layers, known.parameters(**dict(step.given)), notes)
+        except CannotConvert as error:
+            raise CannotDerive(error.detail, error.problems, step=step.name) from error
         layers = Layers({**layers.parts, **made.parts}, layers.datum or made.datum, layers.levels)
     return layers

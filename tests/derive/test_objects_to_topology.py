@@ -22,7 +22,7 @@ def objects(geometry: Any, kind: str = "path", name: str = "a") -> Features:
 
 
 def network(layers: Layers, **options: Any) -> dict[str, Features]:
-    made = objects_to_topology(layers, Parameters(**options))
+    made = objects_to_topology(layers, Parameters(**options), derive.Notes())
     assert {k.layer for k in made.parts} == {"topology"}
     assert {k.name for k in made.parts} == {NETWORK}
     return {k.level: p for k, p in made.parts.items() if isinstance(p, Features)}

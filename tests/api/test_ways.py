@@ -1,0 +1,123 @@
+"""Parameters of derivations come from the request, and a derivation that finds nothing to use gives way to another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app import derive
+from app.bundle import Hints
+from app.convert import offline
+from app.derive import Notes, derives
+from app.errors import CannotConvert, CannotDerive, Invalid, MissingLayer
+from app.model.grid import FREE, OccupancyGrid
+from app.model.layers import Layers, PartKey
+from app.parameters import parameter
+from tests.api.conftest import Api
+
+SQUARE = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"name": "bed"},
+"geometry": {"type": "Polygon", "coordinates":
+[[[0.001, 0], [0.002, 0], [0.002, 0.001], [0.001, 0.001], [0.001, 0]]]}}]}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Blank:
+    """Of a made-up derivation."""
+
+    side: int = parameter(4, "cells a side", minimum=1, maximum=100)
+
+
+@dataclass(frozen=True, slots=True)
+class Nothing:
+    """No parameters."""
+
+
+@pytest.fixture
+def blank(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two more ways to a grid, of which the cheaper one never works."""
+    known = dict(derive.all_derivations())
+    monkeypatch.setattr(derive, "_registry", {k: d for k, d in known.items() if d.gives != "occupancy"})
+
+    @derives(gives="occupancy", needs={"objects"}, parameters=Blank, cost=5.0)
+    def blank_grid(layers: Layers, parameters: Blank, notes: Notes) -> Layers:
+        """A free square."""
+        notes.warn("it is blank")
+        notes.drop("objects", 1, "a blank grid shows none")
+        cells = np.full((parameters.side, parameters.side), FREE, np.uint8)
+        return Layers({PartKey("occupancy"): OccupancyGrid(cells, 0.5)}, layers.datum, layers.levels)
+
+    @derives(gives="occupancy", needs={"objects"}, parameters=Nothing, cost=1.0)
+    def never(layers: Layers, parameters: Nothing, notes: Notes) -> Layers:
+        """A derivation that finds nothing."""
+        raise CannotConvert("there is nothing red among the objects")
+
+
+def test_the_next_way_is_taken_and_notes_are_told(blank: None) -> None:
+    made = offline({"a.geojson": SQUARE}, "occupancy_grid", options={"side": "7"})
+    assert b"7 7" in made.files["map.pgm"][:20]
+    line = next(line for line in made.report["layers"] if line["layer"] == "occupancy")
+    assert line["information"] == "derived"
+    assert line["sources"] == ["a.geojson"]
+    assert line["steps"] == [{"step": "blank_grid", "from": ["objects"], "to": "occupancy", "parameters": {"side": 7}}]
+    assert {"problem": "it is blank"} in made.report["warnings"]
+    assert {"what": "objects", "count": 1, "why": "a blank grid shows none"} in made.report["dropped"]
+
+
+def test_when_nothing_is_left_every_reason_is_told(blank: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(derive._registry, "blank_grid")
+    with pytest.raises(MissingLayer, match="nothing red") as caught:
+        offline({"a.geojson": SQUARE}, "occupancy_grid")
+    assert "supply an occupancy grid" in caught.value.detail
+
+
+def test_a_parameter_makes_a_stored_layer_anew(blank: None) -> None:
+    yaml = b"image: map.pgm\nresolution: 0.5\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    files = {"map.yaml": yaml, "map.pgm": b"P5 2 1 255\n\0\xfe", "a.geojson": SQUARE}
+    stored = offline(files, "occupancy_grid")
+    assert [told["information"] for told in stored.report["layers"] if told["layer"] == "occupancy"] == ["raw"]
+    made = offline(files, "occupancy_grid", options={"side": "3"})
+    assert b"3 3" in made.files["map.pgm"][:20]
+    assert [told["information"] for told in made.report["layers"] if told["layer"] == "occupancy"] == ["derived"]
+    with pytest.raises(Invalid, match="side"):
+        offline(files, "occupancy_grid", options={"side": "3"}, derived=False)
+
+
+def test_wrong_parameters_are_named(blank: None) -> None:
+    with pytest.raises(Invalid, match="at least 1"):
+        offline({"a.geojson": SQUARE}, "occupancy_grid", options={"side": "0"})
+    with pytest.raises(Invalid, match="colour") as caught:
+        offline({"a.geojson": SQUARE}, "occupancy_grid", options={"colour": "red"})
+    assert [p.where for p in caught.value.problems] == ["colour"]
+    with pytest.raises(Invalid, match="outlines"):  # a derivation's, but not one on the way to this format
+        offline({"a.geojson": SQUARE}, "datum", options={"outlines": "true"}, hints=Hints(layer="location"))
+
+
+def test_a_failing_step_is_named() -> None:
+    step = derive.plan(frozenset({"objects"}), frozenset({"topology"}))
+    assert step is not None
+    with pytest.raises(CannotDerive) as caught:
+        derive.run([s for s in step.steps if s.name == "objects_to_topology"], Layers())
+    assert caught.value.step == "objects_to_topology"
+
+
+def test_over_http(api: Api) -> None:
+    api.post("environments", {"name": "beds"})
+    api.upload("beds", {"a.geojson": SQUARE})
+    refused: Any = api.get("/maps/beds/tmap2?join=0.5", expect=None)
+    assert refused.status_code == 422
+    assert "outlines=true" in refused.json()["detail"]
+    again: Any = api.get("/maps/beds/tmap2?join=0.5", expect=None)
+    assert again.status_code == 422, "what was tried is remembered"
+    got = api.get("/maps/beds/tmap2?outlines=true")
+    assert got.content.count(b"- meta:") == 4
+    report = api.get("environments/beds/versions/1/reports/tmap2?outlines=true").json()
+    line = next(line for line in report["layers"] if line["layer"] == "topology")
+    assert line["steps"][0]["parameters"] == {"join": 0.1, "outlines": True}
+    assert api.get("/maps/beds/tmap2?outlines=perhaps", expect=None).status_code == 422
+    assert api.get("/maps/beds/kml?outlines=true", expect=None).status_code == 422, "no step on the way takes it"
+    table = {row["format"]: row for row in api.get("environments/beds/versions/1/maps").json()}
+    assert table["tmap2"]["state"] in ("missing", "derivable")
