@@ -8,11 +8,9 @@ from lxml import etree
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Limits
+from app.model.prolog import check_prolog
 
-_DOCTYPE = re.compile(rb"<!\s*(DOCTYPE|ENTITY)", re.IGNORECASE)
-_PROLOG = re.compile(rb"\s+|<\?.*?\?>|<!--.*?-->", re.DOTALL)
-"""What may stand before the root element. A DOCTYPE further inside is a text (HTML in a description)."""
-
+__all__ = ["MAX_ATTRIBUTES", "attributes", "check_bounds", "check_prolog", "parse"]
 
 MAX_ATTRIBUTES = 256
 """Of one element. Real ones have about ten; lxml takes quadratic time to list them."""
@@ -41,21 +39,6 @@ def parse(
         raise UnreadableFile("a DOCTYPE is not accepted: remove it", [Problem("DOCTYPE is not accepted", line=1)])
     check_bounds(root, limits, None if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in data[:4] else data)
     return root
-
-
-def check_prolog(data: bytes) -> None:
-    """Refuse a DOCTYPE or entity declaration before any parser sees it (``parse`` looks again at what it found)."""
-    head = data
-    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        head = head[: 2**20].decode("utf-16", "replace").encode()
-    head = head.lstrip(b"\xef\xbb\xbf")
-    at = 0
-    while blank := _PROLOG.match(head, at):
-        at = blank.end()
-    if _DOCTYPE.match(head, at):
-        line = head.count(b"\n", 0, at) + 1
-        reason = "DOCTYPE and entity declarations are not accepted: remove them"
-        raise UnreadableFile(reason, [Problem(reason, line=line)])
 
 
 def attributes(element: etree._Element) -> dict[str, str]:

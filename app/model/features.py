@@ -21,6 +21,9 @@ zones      ``value``         what the kind needs: a speed in m/s, a priority …
 zones      ``expires``       RFC 3339 time at which the zone ends
 objects    ``pose``          [x, y, z, roll, pitch, yaw], metres and radians, local frame
 objects    ``size``          [x, y, z], metres
+objects    ``shapes``        its solids, see ``app.model.solids``
+objects    ``height``        metres of an extruded footprint's top above the level's floor
+objects    ``base``          metres of its underside above the level's floor, else 0
 all        ``<format>``      what only that format knows of the item, kept for the way back
 ========== ================= =========================================================================================
 """

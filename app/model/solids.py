@@ -1,0 +1,490 @@
+"""Solids of objects: ``properties.shapes`` and mesh files -> triangles, footprints and boxes in the local frame.
+
+An object's collision solids are a list of mappings under ``shapes``, each with a ``type`` and, where it is not the
+identity, a ``pose`` [x, y, z, roll, pitch, yaw] (metres, radians) in the object's own frame; the object's ``pose`` is
+in the local frame. Rotations are SDF's: about the fixed axes x, y, z in this order, R = Rz·Ry·Rx.
+
+========== ============================================= ==============================================================
+type       further words                                 origin and extent
+========== ============================================= ==============================================================
+box        size [x, y, z]                                its middle
+cylinder   radius, length                                its middle, length along z
+capsule    radius, length                                its middle; length of the cylinder between two half spheres
+sphere     radius                                        its middle
+ellipsoid  radii [x, y, z]                               its middle
+plane      normal [x, y, z], size [x, y]                 its middle; a solver takes it as endless, see ``planes``
+polyline   points [[[x, y], …], …], height               rings by even and odd, z from 0 to height
+mesh       file, scale [x, y, z], submesh, center        the file's
+heightmap  file, size [x, y, z], position [x, y, z]      its middle; the picture's brightest pixel is at size z
+========== ============================================= ==============================================================
+
+``visual: true`` marks a shape that only visuals have: nothing collides with it.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import PurePosixPath
+from typing import Any, NoReturn
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import Invalid, Problem, TooLarge
+from app.model import meshes
+from app.model.features import Properties
+from app.model.frame import MAX_METRES
+
+Array = NDArray[np.float64]
+
+MOST_TRIANGLES = 20_000_000
+"""Of one object."""
+
+MOST_SHAPES = 10_000
+"""Of one object."""
+
+MOST_PIXELS = 4097 * 4097
+"""Of a height map."""
+
+TOLERANCE = 0.002
+"""Metres that a round solid's flat sides may lie within the true one."""
+
+MOST_OUTLINES = 5_000
+"""Triangles whose outlines are joined for a footprint; of a mesh with more the convex hull is taken."""
+
+_NOTHING: Array = np.empty((0, 3, 3))
+
+
+@dataclass(slots=True)
+class Solids:
+    """Objects' files, each mesh of which is read once, however many shapes show it.
+
+    resources: by path, as ``Layers.resources()`` gives them. planes: whether planes count, as rectangles of their size.
+    visuals: whether shapes that nothing collides with count too.
+    """
+
+    resources: Mapping[str, bytes]
+    planes: bool = False
+    visuals: bool = False
+    _read: dict[str, meshes.Mesh | Invalid | None] | None = None
+
+    def triangles(self, properties: Properties) -> Array:
+        """An object's solids as triangles, float64 [n, 3, 3], metres, local frame; counter-clockwise from outside where
+        the source says so.
+
+        Raises Invalid that names the file or the shape; the detail says what to supply for a missing file.
+        """
+        shapes = shapes_of(properties)
+        found = [self.shape(shape, f"shapes[{k}]") for k, shape in enumerate(shapes) if self._counts(shape)]
+        if not found:
+            return _NOTHING
+        total = sum(map(len, found))
+        if total > MOST_TRIANGLES:
+            raise TooLarge(f"an object has {total} triangles; the limit is {MOST_TRIANGLES}")
+        return _checked(placed(np.concatenate(found), pose_of(properties)), "pose")
+
+    def footprint(self, properties: Properties) -> Any:
+        """The ground that an object's solids stand over: a valid shapely geometry, metres, local frame; empty where it
+        has none. Of a mesh with very many triangles it is the convex hull."""
+        outlines = []
+        own = matrix(pose_of(properties))
+        for k, shape in enumerate(shapes_of(properties)):
+            if self._counts(shape):
+                corners = self.shape(shape, f"shapes[{k}]")
+                outlines.append(_shadow(_checked(_moved(corners, own), "pose")[:, :, :2]))
+        return shapely.union_all(outlines) if outlines else shapely.Polygon()
+
+    def bounds(self, properties: Properties) -> tuple[float, float, float, float, float, float] | None:
+        """(min x, min y, min z, max x, max y, max z) of an object's solids, metres, local frame; None without any."""
+        flat = self.triangles(properties).reshape(-1, 3)
+        if not len(flat):
+            return None
+        low, high = flat.min(axis=0).tolist(), flat.max(axis=0).tolist()
+        return low[0], low[1], low[2], high[0], high[1], high[2]
+
+    def size(self, properties: Properties) -> tuple[float, float, float] | None:
+        """[x, y, z] of the box around an object's solids in its own frame, metres; None without any."""
+        b = self.bounds({key: value for key, value in properties.items() if key != "pose"})
+        return None if b is None else (b[3] - b[0], b[4] - b[1], b[5] - b[2])
+
+    def shape(self, shape: Mapping[str, Any], where: str = "shape") -> Array:
+        """One shape as triangles in its object's frame, float64 [n, 3, 3]."""
+        kind = shape.get("type")
+        make = _MAKERS.get(kind) if isinstance(kind, str) else None
+        if make is None:
+            _refuse(f"has the type {str(kind)[:80]!r}; there are {', '.join(_MAKERS)}", where)
+        return _checked(_moved(make(self, shape, where), matrix(pose_of(shape, where))), where)
+
+    def mesh(self, file: str) -> meshes.Mesh:
+        """A mesh file, read once. Raises Invalid that names it."""
+        if self._read is None:
+            self._read = {}
+        if file not in self._read:
+            try:
+                self._read[file] = meshes.read_mesh(self.file(file), file)
+            except Invalid as error:
+                self._read[file] = error
+            except TooLarge as error:
+                self._read[file] = Invalid(error.detail, error.problems)
+        known = self._read[file]
+        if isinstance(known, Invalid):
+            raise known
+        assert known is not None
+        return known
+
+    def file(self, path: str) -> bytes:
+        """A resource's bytes; Invalid says that it is to be supplied."""
+        data = self.resources.get(path)
+        if data is None:
+            reason = f"the file {path[:200]} is not there: upload it together with the objects"
+            raise Invalid(reason, [Problem(reason, path[:200])])
+        return data
+
+    def _counts(self, shape: Mapping[str, Any]) -> bool:
+        return (self.visuals or shape.get("visual") is not True) and (self.planes or shape.get("type") != "plane")
+
+
+def triangles(
+    properties: Properties, resources: Mapping[str, bytes], *, planes: bool = False, visuals: bool = False
+) -> Array:
+    """See ``Solids.triangles``; for many objects make one ``Solids``."""
+    return Solids(resources, planes, visuals).triangles(properties)
+
+
+def footprint(
+    properties: Properties, resources: Mapping[str, bytes], *, planes: bool = False, visuals: bool = False
+) -> Any:
+    """See ``Solids.footprint``."""
+    return Solids(resources, planes, visuals).footprint(properties)
+
+
+def bounds(
+    properties: Properties, resources: Mapping[str, bytes], *, planes: bool = False, visuals: bool = False
+) -> tuple[float, float, float, float, float, float] | None:
+    """See ``Solids.bounds``."""
+    return Solids(resources, planes, visuals).bounds(properties)
+
+
+def size(
+    properties: Properties, resources: Mapping[str, bytes], *, planes: bool = False, visuals: bool = False
+) -> tuple[float, float, float] | None:
+    """See ``Solids.size``."""
+    return Solids(resources, planes, visuals).size(properties)
+
+
+def shapes_of(properties: Properties) -> Sequence[Mapping[str, Any]]:
+    """An object's shapes; empty where it says none. Raises Invalid where they are no list of mappings."""
+    said = properties.get("shapes")
+    if said is None:
+        return []
+    if not isinstance(said, (list, tuple)) or not all(isinstance(shape, Mapping) for shape in said):
+        _refuse("must be a list of mappings with a type", "shapes")
+    if len(said) > MOST_SHAPES:
+        _refuse(f"are {len(said)}; the limit is {MOST_SHAPES}", "shapes")
+    return said
+
+
+def pose_of(said: Mapping[str, Any], where: str = "pose") -> tuple[float, ...]:
+    """[x, y, z, roll, pitch, yaw]; missing ones are 0. Raises Invalid where it is no list of finite numbers."""
+    pose = said.get("pose")
+    if pose is None:
+        return (0.0,) * 6
+    if not isinstance(pose, (list, tuple)) or len(pose) > 6:
+        _refuse("must be [x, y, z, roll, pitch, yaw]", f"{where}.pose")
+    numbers = [_number(value, f"{where}.pose", MAX_METRES) for value in pose]
+    return (*numbers, *([0.0] * (6 - len(numbers))))
+
+
+def rotation(roll: float, pitch: float, yaw: float) -> Array:
+    """R = Rz(yaw)·Ry(pitch)·Rx(roll), float64 [3, 3]."""
+    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in (roll, pitch, yaw))
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def matrix(pose: Sequence[float]) -> Array:
+    """A pose [x, y, z, roll, pitch, yaw] as float64 [4, 4]."""
+    out = np.eye(4)
+    out[:3, :3] = rotation(*pose[3:6])
+    out[:3, 3] = pose[:3]
+    return out
+
+
+def placed(corners: Array, pose: Sequence[float]) -> Array:
+    """Points float64 [..., 3] of a frame with this pose in the frame around it."""
+    return _moved(corners, matrix(pose))
+
+
+def _moved(corners: Array, transform: Array) -> Array:
+    if np.array_equal(transform, np.eye(4)):
+        return corners
+    return np.asarray(corners @ transform[:3, :3].T + transform[:3, 3], np.float64)
+
+
+def _checked(corners: Array, where: str) -> Array:
+    if not bool((np.abs(corners) <= MAX_METRES).all()):
+        _refuse(f"gives coordinates that are not finite metres within ±{MAX_METRES:g}", where)
+    return corners
+
+
+def _shadow(corners: Array) -> Any:
+    """The union of triangles [n, 3, 2] seen from above; of very many the convex hull."""
+    if not len(corners):
+        return shapely.Polygon()
+    if len(corners) > MOST_OUTLINES:
+        return shapely.convex_hull(shapely.multipoints(corners.reshape(-1, 2)))
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
+    seen = np.abs(area) > 1e-12
+    if not seen.any():  # a wall without thickness
+        return shapely.convex_hull(shapely.multipoints(corners.reshape(-1, 2)))
+    # A grid of a micrometre makes the union of hundreds of touching slivers sure.
+    return shapely.union_all(shapely.polygons(corners[seen]), grid_size=1e-6)
+
+
+# --- the shapes ------------------------------------------------------------------------------------------------------
+
+
+def _box(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001 - one signature for all shapes
+    return _unit_box() * _vector(shape, "size", 3, where)
+
+
+def _sphere(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
+    radius = _length(shape, "radius", where)
+    return _turned(*_arc(radius, 0.0), _sides(radius))
+
+
+def _ellipsoid(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
+    radii = _vector(shape, "radii", 3, where)
+    sides = _sides(float(radii.max()))
+    return _turned(*_arc(1.0, 0.0, sides), sides) * radii
+
+
+def _capsule(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
+    radius = _length(shape, "radius", where)
+    return _turned(*_arc(radius, _length(shape, "length", where)), _sides(radius))
+
+
+def _cylinder(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
+    radius, half = _length(shape, "radius", where), _length(shape, "length", where) / 2.0
+    return _turned(np.array([0.0, radius, radius, 0.0]), np.array([-half, -half, half, half]), _sides(radius))
+
+
+def _plane(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
+    """A rectangle of the plane's size, turned from +z to its normal the shortest way."""
+    x, y = _vector(shape, "size", 2, where, (1.0, 1.0)) / 2.0
+    flat = np.array([[[-x, -y, 0], [x, -y, 0], [x, y, 0]], [[-x, -y, 0], [x, y, 0], [-x, y, 0]]], np.float64)
+    normal = _vector(shape, "normal", 3, where, (0.0, 0.0, 1.0), least=-MAX_METRES)
+    length = float(np.linalg.norm(normal))
+    if not length:
+        _refuse("must not be zero", f"{where}.normal")
+    a, b, c = normal / length
+    if c < -1.0 + 1e-12:
+        return np.asarray(flat * np.array([1.0, -1.0, -1.0]), np.float64)
+    k = 1.0 / (1.0 + c)
+    turn = np.array([[1 - a * a * k, -a * b * k, a], [-a * b * k, 1 - b * b * k, b], [-a, -b, c]])
+    return np.asarray(flat @ turn.T, np.float64)
+
+
+def _polyline(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  # noqa: ARG001
+    rings = shape.get("points")
+    if not isinstance(rings, (list, tuple)) or not rings:
+        _refuse("must be a list of rings of [x, y]", f"{where}.points")
+    area = shapely.Polygon()
+    for ring in rings:
+        at = _points(ring, f"{where}.points")
+        if len(at) >= 3:
+            area = shapely.symmetric_difference(area, shapely.make_valid(shapely.Polygon(at)))
+    return extruded(area, 0.0, _length(shape, "height", where))
+
+
+def extruded(area: Any, low: float, high: float) -> Array:
+    """A polygon or several (shapely, metres), from one height to another, as closed triangles: float64 [n, 3, 3]."""
+    found = []
+    for polygon in shapely.get_parts(area) if not shapely.is_empty(area) else ():
+        if shapely.get_type_id(polygon) != 3 or shapely.is_empty(polygon):
+            continue
+        oriented = shapely.orient_polygons(polygon)
+        cut = shapely.get_parts(shapely.constrained_delaunay_triangles(oriented))
+        flat = shapely.get_coordinates(cut).reshape(-1, 4, 2)[:, :3]
+        a, b, c = flat[:, 0], flat[:, 1], flat[:, 2]
+        back = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) < (c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
+        flat[back] = flat[back][:, ::-1]
+        found += [_at_height(flat, high), _at_height(flat[:, ::-1], low)]
+        for ring in (oriented.exterior, *oriented.interiors):
+            at = shapely.get_coordinates(ring)
+            a3, b3 = (np.column_stack([p, np.full(len(p), low)]) for p in (at[:-1], at[1:]))
+            up = np.array([0.0, 0.0, high - low])
+            found += [np.stack([a3, b3, b3 + up], axis=1), np.stack([a3, b3 + up, a3 + up], axis=1)]
+    return np.concatenate(found) if found else _NOTHING
+
+
+def _mesh(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:
+    file, part = shape.get("file"), shape.get("submesh")
+    if not isinstance(file, str) or not file:
+        _refuse("must be the path of a mesh among the files of the objects", f"{where}.file")
+    if part is not None and not isinstance(part, str):
+        _refuse("must be a name", f"{where}.submesh")
+    scale = _vector(shape, "scale", 3, where, (1.0, 1.0, 1.0), least=-MAX_METRES)
+    try:
+        corners = solids.mesh(file).triangles(part or None, centre=shape.get("center") is True) * scale
+    except Invalid as error:
+        raise Invalid(error.detail, error.problems or [Problem(error.detail, file)]) from error
+    return corners[:, ::-1] if np.prod(scale) < 0 else corners  # a mirror turns the inside out
+
+
+def _heightmap(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:
+    """A closed solid from a picture: its brightest pixel at the full height, black at 0, the top row at the largest y.
+
+    Source: gz-common ImageHeightmap and HeightmapShape (a pixel over the picture's maximum, times the size's z).
+    """
+    file = shape.get("file")
+    if not isinstance(file, str) or not file:
+        _refuse("must be the path of a picture among the files of the objects", f"{where}.file")
+    extent = _vector(shape, "size", 3, where, (1.0, 1.0, 1.0))
+    position = _vector(shape, "position", 3, where, (0.0, 0.0, 0.0), least=-MAX_METRES)
+    grey = _picture(solids.file(file), file)
+    most = float(grey.max())
+    z = grey[::-1] / (most or 1.0) * extent[2]
+    rows, columns = z.shape
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, columns) * extent[0], np.linspace(-0.5, 0.5, rows) * extent[1])
+    top = np.stack([x, y, z], axis=-1)
+    floor = top.copy()
+    floor[..., 2] = z.min() - max(1e-3, 1e-3 * float(extent[2]))
+    parts = [_sheet(top), _sheet(floor)[:, ::-1]]
+    for edge, base in (
+        (top[0], floor[0]),
+        (top[::-1, 0], floor[::-1, 0]),
+        (top[-1, ::-1], floor[-1, ::-1]),
+        (top[:, -1], floor[:, -1]),
+    ):
+        parts.append(_sheet(np.stack([base, edge])))
+    return np.asarray(np.concatenate(parts) + position, np.float64)
+
+
+def _sheet(at: Array) -> Array:
+    """A grid of points [rows, columns, 3] as triangles, two for each of its squares."""
+    a, b, c, d = at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]
+    both = np.stack([np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)], axis=-3)
+    return both.reshape(-1, 3, 3)
+
+
+def _picture(data: bytes, file: str) -> Array:
+    """A picture's grey values, float64 [rows, columns]."""
+    from PIL import Image
+
+    kinds = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF", ".bmp": "BMP"}
+    kind = kinds.get(PurePosixPath(file).suffix.lower())
+    if kind is None:
+        _refuse(f"must be one of {', '.join(sorted(kinds))}", file)
+    try:
+        with Image.open(io.BytesIO(data), formats=[kind]) as picture:
+            if picture.width * picture.height > MOST_PIXELS:
+                raise TooLarge(f"{file} has {picture.width} × {picture.height} pixels; the limit is {MOST_PIXELS}")
+            deep = picture.mode in ("I", "F") or picture.mode.startswith("I;16")
+            grey = np.asarray(picture if deep else picture.convert("L"), np.float64)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise Invalid(f"{file} cannot be read as a picture: {error}", [Problem(str(error), file)]) from error
+    if grey.ndim != 2 or min(grey.shape) < 2 or not bool(np.isfinite(grey).all()):
+        _refuse("must be a picture of at least 2 × 2 pixels", file)
+    return grey
+
+
+_Maker = Callable[[Solids, Mapping[str, Any], str], Array]
+
+_MAKERS: Mapping[str, _Maker] = {
+    "box": _box,
+    "cylinder": _cylinder,
+    "sphere": _sphere,
+    "capsule": _capsule,
+    "ellipsoid": _ellipsoid,
+    "plane": _plane,
+    "polyline": _polyline,
+    "mesh": _mesh,
+    "heightmap": _heightmap,
+}
+
+TYPES = frozenset(_MAKERS)
+"""The types of shapes."""
+
+
+@cache
+def _unit_box() -> Array:
+    low, high = -0.5, 0.5
+    return extruded(shapely.box(low, low, high, high), low, high)
+
+
+def _sides(radius: float) -> int:
+    """Flat sides of a circle, a multiple of 4 so that the extremes on the axes are exact."""
+    ratio = TOLERANCE / radius if radius > 0 else 1.0
+    wanted = math.pi / math.acos(1.0 - ratio) if ratio < 1.0 else 0.0
+    return int(min(max(4 * math.ceil(wanted / 4.0), 16), 128))
+
+
+def _arc(radius: float, length: float, sides: int = 0) -> tuple[Array, Array]:
+    """(radii, heights) of half a circle from its lowest to its highest point, its halves ``length`` apart."""
+    quarter = (sides or _sides(radius)) // 4
+    angle = np.linspace(0.0, math.pi / 2.0, quarter + 1)
+    r, z = np.sin(angle) * radius, np.cos(angle) * radius + length / 2.0
+    if not length:
+        r, z = r[:-1], z[:-1]
+        return np.concatenate([r, [radius], r[::-1]]), np.concatenate([-z, [0.0], z[::-1]])
+    return np.concatenate([r, r[::-1]]), np.concatenate([-z, z[::-1]])
+
+
+def _turned(radii: Array, heights: Array, sides: int) -> Array:
+    """A curve (radii, heights), upwards, turned round the z axis: triangles without those of no area at the poles."""
+    angle = np.arange(sides + 1) * (2.0 * math.pi / sides)
+    c, s = np.cos(angle), np.sin(angle)
+    quarter = sides // 4
+    c[[quarter, 3 * quarter]], s[[0, 2 * quarter, sides]] = 0.0, 0.0
+    c[-1], s[-1] = c[0], s[0]
+    at = np.stack([radii[:, None] * c, radii[:, None] * s, np.repeat(heights[:, None], sides + 1, axis=1)], axis=-1)
+    out = _sheet(at)
+    flat = np.linalg.norm(np.cross(out[:, 1] - out[:, 0], out[:, 2] - out[:, 0]), axis=1)
+    return out[flat > 0] if bool((flat > 0).any()) else out
+
+
+def _at_height(flat: Array, z: float) -> Array:
+    return np.concatenate([flat, np.full((*flat.shape[:-1], 1), z)], axis=-1)
+
+
+def _refuse(reason: str, where: str) -> NoReturn:
+    raise Invalid(f"{where} {reason}", [Problem(reason, where=where)])
+
+
+def _number(value: Any, where: str, most: float, least: float | None = None) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
+        _refuse(f"must be a finite number of at most {most:g}, got {str(value)[:80]}", where)
+    if least is not None and value < least:
+        _refuse(f"must be at least {least:g}, got {value:g}", where)
+    return float(value)
+
+
+def _length(shape: Mapping[str, Any], word: str, where: str) -> float:
+    return _number(shape.get(word), f"{where}.{word}", MAX_METRES, 0.0)
+
+
+def _vector(
+    shape: Mapping[str, Any], word: str, n: int, where: str, otherwise: Any = None, least: float = 0.0
+) -> Array:
+    said = shape.get(word, otherwise)
+    if not isinstance(said, (list, tuple)) or len(said) != n:
+        _refuse(f"must be {n} numbers", f"{where}.{word}")
+    return np.array([_number(v, f"{where}.{word}", MAX_METRES, least) for v in said])
+
+
+def _points(ring: Any, where: str) -> Array:
+    if not isinstance(ring, (list, tuple)) or not all(isinstance(p, (list, tuple)) and len(p) == 2 for p in ring):
+        _refuse("must be a list of rings of [x, y]", where)
+    return np.array([[_number(v, where, MAX_METRES) for v in p] for p in ring], np.float64).reshape(-1, 2)

@@ -1,0 +1,248 @@
+"""Solids against truths worked out by hand: volumes, boxes, poses, and what cannot be used."""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from app.errors import Invalid
+from app.model import solids
+from app.model.solids import Solids, rotation
+from tests.model.test_meshes import ONE, SHOWN, TRIANGLE, dae, stl
+
+BOX = {"type": "box", "size": [2, 4, 6]}
+
+
+def volume(corners: Any) -> float:
+    """Of closed, outward triangles (divergence theorem): negative or wrong where any is turned."""
+    return float(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
+
+
+def one(shape: dict[str, Any], files: dict[str, bytes] | None = None, **more: Any) -> Any:
+    return solids.triangles({"shapes": [shape], **more}, files or {}, planes=True)
+
+
+def picture(rows: list[list[int]], mode: str = "L") -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(np.array(rows, np.uint8 if mode == "L" else np.uint16)).save(out, "PNG")
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected", "half"),
+    [
+        (BOX, 48.0, (1, 2, 3)),
+        ({"type": "cylinder", "radius": 0.5, "length": 2}, math.pi * 0.25 * 2, (0.5, 0.5, 1)),
+        ({"type": "sphere", "radius": 1.5}, 4 / 3 * math.pi * 1.5**3, (1.5, 1.5, 1.5)),
+        (
+            {"type": "capsule", "radius": 0.5, "length": 2},
+            math.pi * 0.25 * 2 + 4 / 3 * math.pi * 0.125,
+            (0.5, 0.5, 1.5),
+        ),
+        ({"type": "ellipsoid", "radii": [1, 2, 3]}, 4 / 3 * math.pi * 6, (1, 2, 3)),
+    ],
+)
+def test_volume_and_extent_of_primitives(shape: dict[str, Any], expected: float, half: tuple[float, ...]) -> None:
+    made = one(shape)
+    assert volume(made) == pytest.approx(expected, rel=0.01)
+    assert made.reshape(-1, 3).max(axis=0) == pytest.approx(half)
+    assert made.reshape(-1, 3).min(axis=0) == pytest.approx([-v for v in half])
+    edges = np.round(np.stack([made, np.roll(made, -1, axis=1)], axis=2).reshape(-1, 6), 9) + 0.0
+    there = {tuple(e) for e in edges}
+    assert all((*e[3:], *e[:3]) in there for e in there), "closed: each edge is met by its reverse"
+
+
+def test_a_round_solid_is_true_to_millimetres() -> None:
+    """The widest gap between a circle and a chord lies at the chord's middle."""
+    for radius in (0.05, 0.5, 3.0):
+        ring = one({"type": "cylinder", "radius": radius, "length": 1})
+        at = ring.reshape(-1, 3)[:, :2]
+        hull = shapely.convex_hull(shapely.multipoints(at))
+        assert radius - shapely.boundary(hull).distance(shapely.Point(0, 0)) <= 0.0021
+
+
+def test_polyline_rings_count_by_even_and_odd() -> None:
+    rings = [[[0, 0], [4, 0], [4, 4], [0, 4]], [[1, 1], [1, 3], [3, 3], [3, 1]], [[10, 0], [11, 0], [11, 1], [10, 1]]]
+    shape = {"type": "polyline", "points": rings, "height": 2.5}
+    made = one(shape)
+    assert volume(made) == pytest.approx((16 - 4 + 1) * 2.5)
+    assert (made[:, :, 2].min(), made[:, :, 2].max()) == (0, 2.5)
+    ground = solids.footprint({"shapes": [shape]}, {})
+    assert ground.area == pytest.approx(13)
+    assert ground.is_valid
+
+
+def test_a_crossed_ring_is_still_a_solid() -> None:
+    made = one({"type": "polyline", "points": [[[0, 0], [2, 2], [2, 0], [0, 2]]], "height": 1})
+    assert volume(made) == pytest.approx(2)
+
+
+def test_rotation_is_about_fixed_axes() -> None:
+    """Roll first, about the fixed x, then pitch about the fixed y, then yaw about the fixed z."""
+    at = rotation(math.pi / 2, 0, math.pi / 2) @ [0, 0, 1]  # roll: z -> -y; yaw: -y -> x
+    assert at == pytest.approx([1, 0, 0])
+    assert rotation(0, math.pi / 2, 0) @ [1, 0, 0] == pytest.approx([0, 0, -1])
+    assert rotation(math.pi / 2, math.pi / 2, 0) @ [0, 1, 0] == pytest.approx([1, 0, 0])  # y -> z -> x
+
+
+@given(st.tuples(*[st.floats(-4, 4)] * 3))
+@settings(max_examples=50, deadline=None)
+def test_rotation_agrees_with_scipy(angles: tuple[float, float, float]) -> None:
+    from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
+
+    assert rotation(*angles) == pytest.approx(Rotation.from_euler("xyz", angles).as_matrix())
+
+
+def test_object_pose_then_shape_pose_then_scale() -> None:
+    shape = {"type": "mesh", "file": "m/a.stl", "scale": [10, 1, 1], "pose": [1, 0, 0, 0, 0, math.pi / 2]}
+    made = one(shape, {"m/a.stl": stl(TRIANGLE)}, pose=[100, 0, 5, 0, 0, math.pi / 2])
+    # (2,0,0) -> scale (20,0,0) -> turned (0,20,0) -> shifted (1,20,0) -> turned (-20,1,0) -> (80,1,5)
+    assert made[0] == pytest.approx(np.array([[100, 1, 5], [80, 1, 5], [100, -2, 6]]))
+
+
+def test_a_mirrored_mesh_keeps_its_outside() -> None:
+    files = {"a.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"}
+    assert volume(one({"type": "mesh", "file": "a.obj"}, files)) == pytest.approx(1 / 6)
+    assert volume(one({"type": "mesh", "file": "a.obj", "scale": [-2, 1, 1]}, files)) == pytest.approx(2 / 6)
+
+
+def test_a_part_of_a_mesh() -> None:
+    files = {
+        "a.dae": dae(ONE, SHOWN + '<node name="far"><translate>9 9 9</translate><instance_geometry url="#g"/></node>')
+    }
+    assert len(one({"type": "mesh", "file": "a.dae"}, files)) == 2
+    far = one({"type": "mesh", "file": "a.dae", "submesh": "far"}, files)
+    assert far[0, 0].tolist() == [9, 9, 9]
+    middle = one({"type": "mesh", "file": "a.dae", "submesh": "far", "center": True, "scale": [2, 2, 2]}, files)
+    assert middle[0, 0].tolist() == [-1, -1, 0]
+
+
+def test_planes_and_visuals_count_only_where_asked() -> None:
+    plane = {"type": "plane", "normal": [0, 0, 1], "size": [10, 20]}
+    said = {"shapes": [plane, {**BOX, "visual": True}]}
+    assert len(solids.triangles(said, {})) == 0
+    assert solids.bounds(said, {}) is None
+    assert solids.footprint(said, {}).is_empty
+    assert solids.bounds(said, {}, planes=True) == (-5, -10, 0, 5, 10, 0)
+    assert solids.size(said, {}, visuals=True) == (2, 4, 6)
+    for normal, axis in (([0, 0, -1], 2), ([1, 0, 0], 0), ([0, 1, 0], 1)):
+        made = one({**plane, "normal": normal})
+        assert np.ptp(made.reshape(-1, 3)[:, axis]) == pytest.approx(0, abs=1e-12)
+        facing = np.cross(made[0, 1] - made[0, 0], made[0, 2] - made[0, 0])
+        assert facing / np.linalg.norm(facing) == pytest.approx(normal)
+
+
+def test_a_height_map_is_closed_and_north_is_up() -> None:
+    files = {"h.png": picture([[0, 0, 200], [0, 0, 0], [0, 0, 0]])}
+    shape = {"type": "heightmap", "file": "h.png", "size": [4, 2, 3], "position": [10, 0, 1]}
+    made = one(shape, files)
+    highest = made.reshape(-1, 3)[made.reshape(-1, 3)[:, 2].argmax()]
+    assert highest.tolist() == [12, 1, 4], "the brightest pixel, top right, is at the full height"
+    # Two triangles of area 1 rise to a height of 3 at one corner each, on a floor 3 mm thick.
+    assert volume(solids.placed(made, (-10, 0, -1, 0, 0, 0))) == pytest.approx(2 * 1 * 3 / 3 + 8 * 0.003)
+    deep = one(shape, {"h.png": picture([[0, 65535], [0, 0]], "I;16")})
+    assert deep[:, :, 2].max() == pytest.approx(4)
+    assert volume(deep) > 0
+
+
+def test_footprints() -> None:
+    turned = {"shapes": [BOX], "pose": [10, 0, 0, 0, 0, math.pi / 2]}
+    ground = solids.footprint(turned, {})
+    assert ground.bounds == pytest.approx((8, -1, 12, 1))
+    assert ground.area == pytest.approx(8)
+    two = {"shapes": [BOX, {**BOX, "pose": [5, 0, 0, 0, 0, 0]}]}
+    assert solids.footprint(two, {}).area == pytest.approx(16)
+    flat = {"shapes": [{"type": "mesh", "file": "a.obj"}]}
+    wall = {"a.obj": b"v 0 0 0\nv 1 0 0\nv 1 0 1\nf 1 2 3\n"}
+    assert solids.footprint(flat, wall).length == pytest.approx(1), "a wall without thickness is a line"
+    assert solids.footprint({}, {}).is_empty
+
+
+def test_a_mesh_that_many_objects_show_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    from app.model import meshes
+
+    read: list[str] = []
+    real = meshes.read_mesh
+
+    def watched(data: bytes, name: str) -> meshes.Mesh:
+        read.append(name)
+        return real(data, name)
+
+    monkeypatch.setattr(meshes, "read_mesh", watched)
+    many = Solids({"a.stl": stl(TRIANGLE), "bad.stl": b""})
+    for _ in range(5):
+        assert len(many.triangles({"shapes": [{"type": "mesh", "file": "a.stl"}] * 3})) == 3
+        with pytest.raises(Invalid, match=r"bad\.stl"):
+            many.triangles({"shapes": [{"type": "mesh", "file": "bad.stl"}]})
+    assert read == ["a.stl", "bad.stl"]
+
+
+@pytest.mark.parametrize(
+    ("shapes", "says"),
+    [
+        ("box", "must be a list"),
+        ([1], "must be a list"),
+        ([{}], "has the type 'None'; there are box"),
+        ([{"type": ["box"]}], "has the type"),
+        ([{"type": "box"}], r"shapes\[0\]\.size must be 3 numbers"),
+        ([{"type": "box", "size": [1, 2]}], "must be 3 numbers"),
+        ([{"type": "box", "size": [1, -2, 3]}], "at least 0"),
+        ([{"type": "box", "size": [1, float("nan"), 3]}], "finite"),
+        ([{"type": "box", "size": [1, True, 3]}], "finite"),
+        ([{"type": "box", "size": [1, 10**400, 3]}], "finite"),
+        ([{"type": "sphere", "radius": None}], "finite"),
+        ([{**BOX, "pose": [0, 0, float("inf")]}], "finite"),
+        ([{**BOX, "pose": "0 0 0"}], "must be .x, y, z"),
+        ([{**BOX, "pose": [1e7, 1e7, 0, 0, 0, 0.5]}], "not finite metres"),
+        ([{"type": "mesh"}], "path of a mesh"),
+        ([{"type": "mesh", "file": "absent.dae"}], "absent.dae is not there: upload it together"),
+        ([{"type": "mesh", "file": "../../etc/passwd"}], "not there"),
+        ([{"type": "plane", "normal": [0, 0, 0]}], "must not be zero"),
+        ([{"type": "polyline", "height": 1}], "list of rings"),
+        ([{"type": "polyline", "points": [[[0, 0], [1]]], "height": 1}], "list of rings"),
+        ([{"type": "polyline", "points": [[[0, 0], [1, 1], [0, "a"]]], "height": 1}], "finite"),
+        ([{"type": "heightmap", "file": "h.svg"}], "not there"),
+        ([{"type": "heightmap", "file": "bad.png"}], "bad.png cannot be read as a picture"),
+        ([{"type": "heightmap", "file": "dot.png"}], "2 × 2"),
+        ([BOX] * 10_001, "the limit is 10000"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_its_place(shapes: Any, says: str) -> None:
+    files = {"bad.png": b"\x89PNG\r\n\x1a\n1234", "dot.png": picture([[1]])}
+    with pytest.raises(Invalid, match=says) as caught:
+        solids.triangles({"shapes": shapes}, files, planes=True)
+    assert caught.value.problems
+
+
+def test_degenerate_solids_are_no_error() -> None:
+    for shape in (
+        {"type": "box", "size": [0, 0, 0]},
+        {"type": "sphere", "radius": 0},
+        {"type": "cylinder", "radius": 0, "length": 0},
+        {"type": "polyline", "points": [[[0, 0], [1, 1]]], "height": 1},
+    ):
+        made = one(shape)
+        assert np.isfinite(made).all()
+        assert solids.footprint({"shapes": [shape]}, {}).area == 0
+
+
+def test_a_heavy_mesh_has_a_footprint_soon() -> None:
+    n = 60_000
+    corners = np.random.default_rng(1).uniform(-5, 5, (n, 3, 3)).astype("<f4")
+    record = np.zeros(n, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")]))
+    record["corners"] = corners
+    data = b" " * 80 + n.to_bytes(4, "little") + record.tobytes()
+    start = time.perf_counter()
+    ground = solids.footprint({"shapes": [{"type": "mesh", "file": "a.stl"}]}, {"a.stl": data})
+    assert ground.is_valid
+    assert ground.area == pytest.approx(100, rel=0.01)
+    assert time.perf_counter() - start < 2
