@@ -233,7 +233,7 @@ def _set_aside(groups: list[Group], bundle: Bundle) -> list[Group]:
         sibling = name.replace("_autogen", "", 1) if "_autogen" in PurePosixPath(name).name else None
         if sibling in mains and mains[sibling].format is group.format:
             reason = f"{sibling} is used instead of what was generated"
-        elif group.format.drawing and folder == "topological" and not _is_regions(name):
+        elif (group.format.drawing or group.format.name == "prm") and folder == "topological" and not _is_regions(name):
             richer = next((n for n in ("tmap2", "tmap") if (n, "topological") in kinds), None)
             if richer is not None:
                 reason = f"the network comes from the richer {richer} file"

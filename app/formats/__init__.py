@@ -148,6 +148,7 @@ class Format:
     where grids lie, not their cells. joined: its main files of one folder are one map (graphs 0.yaml, 1.yaml …).
     check: the loader rules of the map's consumers, looked at in a map's files (main file first) without our reader
     or writer; ``app.formats.check`` says what it gives and what it may cost.
+    looks_at: files of other maps of the upload that it looks into.
     """
 
     name: str
@@ -160,6 +161,7 @@ class Format:
     write: Callable[[Layers, WriteContext], dict[str, bytes]] | None = None
     needs: Needs = field(default_factory=lambda: Needs(()))
     companions: Callable[[str, bytes, Sequence[str]], Iterable[str]] = lambda main, data, names: ()
+    looks_at: Callable[[str, Sequence[str]], Iterable[str]] = lambda main, names: ()
     read_options: type[Any] = NoOptions
     write_options: type[Any] = NoOptions
     family: str = ""
@@ -176,11 +178,15 @@ class Format:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """The files of an upload that are one map: a main file and what belongs to it."""
+    """The files of an upload that are one map: a main file and what belongs to it.
+
+    borrowed: what belongs to other maps, and is looked into.
+    """
 
     format: Format
     main: str
     files: Files
+    borrowed: Files = field(default_factory=dict)
 
 
 _registry: dict[str, Format] = {}
@@ -253,7 +259,9 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
                 continue
             others += further
         used.update([main, *others])
-        out.append(Group(known, main, {n: files[n] for n in [main, *others]}))
+        own = {n: files[n] for n in [main, *others]}
+        seen = {n: files[n] for n in known.looks_at(main, sorted(files)) if n in files and n not in own}
+        out.append(Group(known, main, own, seen))
     return out, sorted(set(files) - used)
 
 
@@ -291,7 +299,7 @@ def read(item: Group, context: ReadContext) -> Layers:
         context.options = known.read_options()
     try:
         with _without_collector():
-            layers = known.read(item.files, context)
+            layers = known.read({**item.files, **item.borrowed} if item.borrowed else item.files, context)
     except BadUpload as error:
         raise type(error)(
             error.detail, [_in_file(p, item.main) for p in error.problems] or [_said(error, item)]

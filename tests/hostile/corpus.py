@@ -674,7 +674,273 @@ def folder_cases() -> Iterator[Case]:
         yield Case(f"noise/{name}", {name: noise}, "refused")
 
 
-ACCORDING_TO_KIND = (yaml_cases, xml_cases, pbf_cases, json_cases, picture_cases, archive_cases, folder_cases)
+# --- networks as YAML --------------------------------------------------------------------------------------------
+
+
+PRM = (
+    "nodes:\n- {{id: {id}, x: {x}, y: 1}}\n- {{id: 2, x: 5, y: 5}}\nedges:\n- {{from: {a}, to: 2, weight: {w}}}\n{more}"
+)
+FFR = "internal_points:\n- {{name: {name}, x: {x}, y: 0}}\n- {{name: b, x: 5, y: 0}}\nnetwork_lines:\n- {{start: {{x: {x}, y: 0}}, end: {end}}}\n"
+PICTURE = "picture: {resolution: 0.1, origin: [0, 0, 0], height: 50}\n"
+TMAP = "- meta: {{map: m, node: a, pointset: p}}\n  node:\n    name: {name}\n    edges: {edges}\n    pose: {{position: {{x: {x}, y: 0}}}}\n"
+NAVGRAPH = "%YAML 1.2\n%TAG ! tag:fawkesrobotics.org,navgraph/\n---\ngraph-name: g\nnodes:\n  - name: {name}\n    pos: {pos}\n  - name: b\n    pos: [1, 1]\nconnections:\n  - {link}\n"
+NAV_GRAPH = "building_name: b\nlevels:\n  L1:\n    vertices:\n    - [{x}, 0.0, {{name: {name}}}]\n    - [1.0, 1.0, {{}}]\n    lanes:\n    - {lane}\n"
+
+
+def network_cases() -> Iterator[Case]:
+    """The networks of topological_navigation (the older list), environment_common, Fawkes and Open-RMF."""
+    bad_numbers = (
+        ".nan",
+        ".inf",
+        "-.inf",
+        "1.0e+400",
+        HUGE,
+        "true",
+        "'1'",
+        "null",
+        "[1]",
+        "{{a: 1}}",
+        "1e3e3",
+        "!!python/object:os.system 1",
+    )
+    names = (
+        ('"a\\u202eb"', "read"),
+        ('"a\\nb"', "refused"),
+        ('"\\0"', "refused"),
+        ("a" * 300, "refused"),
+        ("[a]", "refused"),
+    )
+    for k, bad in enumerate(bad_numbers):
+        number = bad.replace("{{", "{").replace("}}", "}")
+        verdict: Verdict = "any" if bad in ("'1'", "null") else "refused"
+        yield Case(
+            f"prm/x {k}", {"p.yaml": PRM.format(id=1, x=number, a=1, w=1, more=PICTURE).encode()}, "refused", "prm"
+        )
+        weight: Verdict = "refused"
+        yield Case(
+            f"prm/weight {k}", {"p.yaml": PRM.format(id=1, x=1, a=1, w=number, more=PICTURE).encode()}, weight, "prm"
+        )
+        picture = PICTURE.replace("0.1", number)
+        yield Case(
+            f"prm/resolution {k}", {"p.yaml": PRM.format(id=1, x=1, a=1, w=1, more=picture).encode()}, "refused", "prm"
+        )
+        picture = PICTURE.replace("50", number)
+        yield Case(
+            f"prm/height {k}", {"p.yaml": PRM.format(id=1, x=1, a=1, w=1, more=picture).encode()}, "refused", "prm"
+        )
+        yield Case(
+            f"ffr/x {k}",
+            {"n.ffr.yaml": FFR.format(name="a", x=number, end="{x: 5, y: 0}").encode()},
+            "refused",
+            "ffr_network",
+        )
+        yield Case(f"tmap/x {k}", {"n.tmap": TMAP.format(name="a", edges="[]", x=number).encode()}, verdict, "tmap")
+        yield Case(
+            f"navgraph/pos {k}",
+            {"navgraph.yaml": NAVGRAPH.format(name="a", pos=f"[{number}, 0]", link="[a, b]").encode()},
+            verdict,
+            "navgraph",
+        )
+        yield Case(
+            f"nav graph/x {k}",
+            {"0.yaml": NAV_GRAPH.format(name="a", x=number, lane="[0, 1, {}]").encode()},
+            verdict,
+            "rmf_nav_graph",
+        )
+    for k, (name, found) in enumerate(names):
+        told: Verdict = "read" if found == "read" else "refused"
+        yield Case(
+            f"ffr/name {k}",
+            {"n.ffr.yaml": FFR.format(name=name, x=1, end="{x: 5, y: 0}").encode()},
+            "any" if told == "read" else told,
+            "ffr_network",
+        )
+        yield Case(
+            f"prm/id {k}",
+            {"p.yaml": PRM.format(id=name, x=1, a=2, w=1, more=PICTURE).encode()},
+            "any" if told == "read" else told,
+            "prm",
+        )
+        yield Case(f"tmap/name {k}", {"n.tmap": TMAP.format(name=name, edges="[]", x=1).encode()}, told, "tmap")
+        yield Case(
+            f"navgraph/name {k}",
+            {"navgraph.yaml": NAVGRAPH.format(name=name, pos="[0, 0]", link="[b, b]").encode()},
+            "any" if told == "read" else told,
+            "navgraph",
+        )
+        yield Case(
+            f"nav graph/name {k}",
+            {"0.yaml": NAV_GRAPH.format(name=name, x=1, lane="[0, 1, {}]").encode()},
+            "any",
+            "rmf_nav_graph",
+        )
+    plain = PRM.format(id=1, x=1, a=1, w=1, more="")
+    yield Case("prm/without its map", {"p.yaml": plain.encode()}, "refused", "prm")
+    yield Case(
+        "prm/map that is no map", {"p.yaml": plain.encode(), "map.yaml": b"image: ../../etc/passwd\n"}, "refused"
+    )
+    yield Case(
+        "prm/map from elsewhere",
+        {"p.yaml": plain.encode(), **room(ROOM.replace(b"room.pgm", b"/etc/passwd"), name="room.pgm")},
+        "refused",
+    )
+    yield Case(
+        "prm/huge map",
+        {"p.yaml": plain.encode(), "map.yaml": ROOM, "room.pgm": b"P5 2000000000 2000000000 255\n"},
+        "refused",
+    )
+    yield Case("prm/map is itself", {"map.yaml": (plain + "image: map.yaml\n").encode()}, "refused", "prm")
+    yield Case(
+        "prm/edge to nowhere", {"p.yaml": PRM.format(id=1, x=1, a=77, w=1, more=PICTURE).encode()}, "read", "prm"
+    )
+    yield Case("prm/self loop", {"p.yaml": PRM.format(id=1, x=1, a=2, w=1, more=PICTURE).encode()}, "read")
+    yield Case("prm/id twice", {"p.yaml": PRM.format(id=2, x=1, a=2, w=1, more=PICTURE).encode()}, "read")
+    for word in ("nodes", "edges"):
+        for value in ("3", "null", "{}", "[null]", "[[]]", "[3]"):
+            text = (plain + PICTURE).replace(f"{word}:\n", f"{word}: {value}\nold_{word}:\n")
+            yield Case(f"prm/{word} {value}", {"p.yaml": text.encode()}, "any", "prm")
+    many = "nodes:\n" + "".join(f"- {{id: {k}, x: {k % 9}, y: 1}}\n" for k in range(20000)) + "edges:\n"
+    many += "".join(f"- {{from: 0, to: {k}, weight: 1}}\n" for k in range(20000))
+    yield Case("prm/a star of 20 000", {"p.yaml": (many + PICTURE).encode()}, "read", "prm")
+    same = "internal_points:\n" + "- {name: a, x: 1, y: 1}\n" * 20000 + "network_lines:\n"
+    same += "- {start: {x: 1, y: 1}, end: {x: 1, y: 1}}\n" * 20000
+    yield Case("ffr/20 000 points in one place", {"n.ffr.yaml": same.encode()}, "read", "ffr_network")
+    for k, end in enumerate(("3", "null", "{}", "[5, 0]", "{x: 5}", "{x: 5, y: '0'}")):
+        yield Case(
+            f"ffr/end {k}", {"n.ffr.yaml": FFR.format(name="a", x=1, end=end).encode()}, "refused", "ffr_network"
+        )
+    yield Case("ffr/line to nowhere", {"n.ffr.yaml": FFR.format(name="a", x=1, end="{x: 9, y: 9}").encode()}, "read")
+    for k, edges in enumerate(
+        ("3", "{}", "[3]", "[[]]", "[{node: [a]}]", "[{}]", "[{node: a, edge_id: {}}]", "[null]")
+    ):
+        yield Case(f"tmap/edges {k}", {"n.tmap": TMAP.format(name="a", edges=edges, x=1).encode()}, "any", "tmap")
+    yield Case("tmap/scalars", {"n.tmap": b"- 3\n- node\n"}, "refused", "tmap")
+    yield Case("tmap/deep", {"n.tmap": b"- node:\n    name: a\n    verts: " + b"[" * 5000}, "refused", "tmap")
+    yield Case(
+        "tmap/alias bomb",
+        {
+            "n.tmap": b"- node: &a {name: x, pose: {position: {x: 1, y: 1}}, verts: [1, 2]}\n- node: &b [*a, *a]\n- node: &c [*b, *b]\n"
+        },
+        "refused",
+        "tmap",
+    )
+    links = (
+        "[a]",
+        "[a, b, c]",
+        "3",
+        "!dir 3",
+        "!dir [a]",
+        "!sudo [a, b]",
+        "!!python/name:os.system [a, b]",
+        "{a: b}",
+        "[[a], [b]]",
+        "[a, nowhere]",
+        "[a, a]",
+        "*x",
+        "&x [*x, *x]",
+        "!split-intersection [a, b]",
+    )
+    for k, link in enumerate(links):
+        yield Case(
+            f"navgraph/connection {k}",
+            {"navgraph.yaml": NAVGRAPH.format(name="a", pos="[0, 0]", link=link).encode()},
+            "any",
+            "navgraph",
+        )
+    for k, pos in enumerate(("[]", "[1]", "[1, 2, 3]", "3", "{x: 1}", "[[1], [2]]", "null")):
+        yield Case(
+            f"navgraph/position {k}",
+            {"navgraph.yaml": NAVGRAPH.format(name="a", pos=pos, link="[a, b]").encode()},
+            "refused",
+            "navgraph",
+        )
+    graph = NAVGRAPH.format(name="a", pos="[0, 0]", link="[a, b]")
+    yield Case(
+        "navgraph/another tag prefix",
+        {"navgraph.yaml": graph.replace("fawkesrobotics.org", "evil.example").encode()},
+        "any",
+        "navgraph",
+    )
+    yield Case(
+        "navgraph/properties that are no list",
+        {"navgraph.yaml": graph.replace("    pos: [0, 0]", "    pos: [0, 0]\n    properties: 3").encode()},
+        "refused",
+        "navgraph",
+    )
+    yield Case("navgraph/second document", {"navgraph.yaml": (graph + "---\na: 1\n").encode()}, "refused", "navgraph")
+    lanes = (
+        "[0]",
+        "[0, 1]",
+        "[0, 7, {}]",
+        "[-1, 1, {}]",
+        "[true, 1, {}]",
+        "[0.5, 1, {}]",
+        "['0', 1, {}]",
+        "[0, 1, 3]",
+        "3",
+        "{}",
+        "[0, 0, {}]",
+        "[0, 1, {}, {}]",
+        f"[0, {HUGE}, {{}}]",
+        "[0, 1, {speed_limit: .nan}]",
+        "[0, 1, {speed_limit: fast}]",
+        "[0, 1, {mutex: [a]}]",
+        "[18446744073709551616, 1, {}]",
+    )
+    for k, lane in enumerate(lanes):
+        yield Case(
+            f"nav graph/lane {k}",
+            {"0.yaml": NAV_GRAPH.format(name="a", x=1, lane=lane).encode()},
+            "any",
+            "rmf_nav_graph",
+        )
+    for k, level in enumerate(
+        (
+            "3",
+            "[]",
+            "{vertices: 3}",
+            "{vertices: [3], lanes: []}",
+            "{vertices: [[1]], lanes: []}",
+            "{lanes: [[0, 1, {}]]}",
+            "{vertices: [[0, 0, 3]]}",
+            "null",
+        )
+    ):
+        text = f"building_name: b\nlevels:\n  L1: {level}\n"
+        yield Case(f"nav graph/level {k}", {"0.yaml": text.encode()}, "any", "rmf_nav_graph")
+    for k, more in enumerate(
+        (
+            "doors: 3\n",
+            "doors: {d: 3}\n",
+            "doors: {d: {endpoints: [1, 2]}}\n",
+            "lifts: {l: {position: [a]}}\n",
+            "lifts: [3]\n",
+            "doors: {d: {endpoints: [[.nan, 0], [1, 1]], map: L1}}\n",
+        )
+    ):
+        text = NAV_GRAPH.format(name="a", x=1, lane="[0, 1, {}]") + more
+        yield Case(f"nav graph/more {k}", {"0.yaml": text.encode()}, "any", "rmf_nav_graph")
+    star = "building_name: b\nlevels:\n  L1:\n    vertices:\n" + "    - [1.0, 1.0, {}]\n" * 20000 + "    lanes:\n"
+    star += "".join(f"    - [0, {k}, {{}}]\n" for k in range(20000))
+    yield Case("nav graph/a star of 20 000", {"0.yaml": star.encode()}, "read", "rmf_nav_graph")
+    yield Case(
+        "nav graph/500 of them",
+        {f"{k}.yaml": NAV_GRAPH.format(name=f"n{k}", x=1, lane="[0, 1, {}]").encode() for k in range(500)},
+        "read",
+        "rmf_nav_graph",
+    )
+
+
+ACCORDING_TO_KIND = (
+    yaml_cases,
+    xml_cases,
+    pbf_cases,
+    json_cases,
+    picture_cases,
+    archive_cases,
+    folder_cases,
+    network_cases,
+)
 
 
 def cases() -> list[Case]:

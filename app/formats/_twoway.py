@@ -1,0 +1,119 @@
+"""Graphs whose edges have no direction (``prm``, ``ffr_network``) <-> directed edges, and back.
+
+A line of the file is two directed edges: the first carries what the file says of it, the second ``backward``; both
+carry ``line``, the line's place in the file, so that they find each other again. A line that says ``oneway: true`` (our
+own word: these formats have none) is one edge.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from app.formats import ReadContext, WriteContext
+from app.formats._network import Array, Edge, Net, edge_lines, natural, own, some
+from app.model.features import Properties, unique_ids
+
+ONEWAY = "oneway"
+WORDS = ("action", "name", "speed_limit", "width")
+"""Canonical words of edges that a line may say, too."""
+
+NODE_CANONICAL = frozenset({"kind", "name", "drawn_from"})
+EDGE_CANONICAL = frozenset({"kind", "source", "target", "drawn_from", *WORDS})
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line of a file: places of the nodes at its ends, and what else it says."""
+
+    a: int
+    b: int
+    said: dict[str, Any]
+
+
+def canonical(words: Iterable[str], said: dict[str, Any]) -> dict[str, Any]:
+    """The canonical words among what an item says, where their values are of the right type."""
+    out: dict[str, Any] = {}
+    for word in words:
+        value = said.get(word)
+        if word in ("speed_limit", "width"):
+            if isinstance(value, (int, float)) and not isinstance(value, bool):
+                out[word] = value
+        elif isinstance(value, str) and value:
+            out[word] = value
+    return out
+
+
+def edges(
+    lines: Sequence[Line], ids: Sequence[str], xyz: Array, name: str
+) -> tuple[list[str], list[Any], list[Properties]]:
+    """Lines -> (ids, geometries, properties) of directed edges. ids, xyz: of the nodes. name: the format's."""
+    rows: list[tuple[int, int]] = []
+    properties: list[Properties] = []
+    for k, line in enumerate(lines):
+        words = canonical(WORDS, line.said)
+        rest = {key: value for key, value in line.said.items() if key not in words}
+        oneway = rest.get(ONEWAY) is True
+        if oneway:
+            del rest[ONEWAY]
+        ends = {"source": ids[line.a], "target": ids[line.b]}
+        properties.append({"kind": "edge", **ends, **words, name: {**({"more": rest} if rest else {}), "line": k}})
+        rows.append((line.a, line.b))
+        if not oneway and line.a != line.b:
+            back = {"source": ids[line.b], "target": ids[line.a]}
+            properties.append({"kind": "edge", **back, **words, name: {"line": k, "backward": True}})
+            rows.append((line.b, line.a))
+    made = unique_ids((f"{p['source']}-{p['target']}" for p in properties), set(ids))
+    return made, list(edge_lines(xyz, [a for a, _ in rows], [b for _, b in rows])), properties
+
+
+def lines(net: Net, context: WriteContext, name: str) -> list[Line]:
+    """Directed edges as lines, in the order of their nodes' places; what lines cannot say is declared."""
+    ordered = sorted(net.edges, key=lambda e: (own(e.properties, name).get("backward") is True, natural(e.id)))
+    pairs: list[tuple[Edge, Edge | None]] = []
+    waiting = ordered
+    for exact in (True, False):  # first the two edges of one line of a file, then whatever leads back
+        open_: dict[tuple[Any, ...], list[Edge]] = defaultdict(list)
+        closed: list[tuple[Edge, Edge]] = []
+        for edge in waiting:
+            key = own(edge.properties, name).get("line") if exact else None
+            key = key if isinstance(key, int) else None
+            partners = open_[edge.target, edge.source, key]
+            if edge.source != edge.target and partners and (key is not None or not exact):
+                closed.append((partners.pop(0), edge))
+            else:
+                open_[edge.source, edge.target, key].append(edge)
+        pairs += closed
+        done = {id(e) for pair in closed for e in pair}
+        waiting = [e for e in waiting if id(e) not in done]
+    pairs += [(edge, None) for edge in waiting]
+    lost = differing = oneway = 0
+    out = []
+    for edge, back in pairs:
+        lost += bool(edge.properties.keys() - EDGE_CANONICAL - {name})
+        words = canonical(WORDS, dict(edge.properties))
+        if back is not None:
+            differing += words != canonical(WORDS, dict(back.properties))
+        more = own(edge.properties, name).get("more")
+        said = {**(more if isinstance(more, dict) else {}), **words}
+        if back is None and edge.source != edge.target:
+            said[ONEWAY] = True
+            oneway += 1
+        out.append(Line(edge.source, edge.target, said))
+    context.drop("attributes of edges", lost, "the format has no place for them")
+    context.drop("attributes of the way back", differing, "a line says the same of both directions")
+    context.drop("edges' bends between their nodes", net.bends, "lines are straight")
+    if oneway:
+        reason = f"{oneway} edges lead one way only, which the format cannot say: they are marked {ONEWAY}: true"
+        context.warn(f"{reason}, but other readers will drive them both ways")
+    return sorted(out, key=lambda line: (line.a, line.b))
+
+
+def warn_lonely(count: int, linked: Iterable[int], names: Sequence[str], context: ReadContext) -> None:
+    """Name nodes that no line reaches."""
+    reached = set(linked)
+    lonely = [names[k] for k in range(count) if k not in reached]
+    if lonely:
+        context.warn(f"{len(lonely)} nodes have no lines: {some(lonely)}")

@@ -1,0 +1,237 @@
+"""ffr_network: environment_common's FFR networks, as YAML: named points, and lines between their coordinates.
+
+``internal_points``: ``{name, x, y}`` in metres in the local frame; ``network_lines``: ``{start: {x, y}, end: {x, y}}``,
+in both directions. A line's ends are the points at these very coordinates. Source: environment_common,
+convertors/ffrnetwork_to_tmap.py, which reads ``topological/network.ffr.yaml`` (it puts each line to both of its ends;
+that the way back then leads from a node to itself is a slip of its).
+
+Canonical: a node's id is its name, an edge's ``<from>-<to>``; see ``_twoway`` for edges of both directions. A point's
+``z`` is its altitude. ``properties.ffr_network`` holds ``more`` (further keys of a point, or of a line and under
+``start`` and ``end`` of its ends), ``name`` where it is not the id; the document's ``ffr_network`` holds ``top``
+(further keys of the file) and ``dangling`` (lines that end at no point).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from app.errors import Problem, UnreadableFile
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _yaml, register
+from app.formats._network import (
+    Array,
+    checked_name,
+    identifier,
+    is_name,
+    joined,
+    known_document,
+    natural,
+    node_points,
+    number,
+    own,
+    refuse,
+    some,
+    without_repeats,
+)
+from app.formats._text import METRES, numbers
+from app.formats._twoway import NODE_CANONICAL, Line, edges, lines, warn_lonely
+from app.model.features import Properties, from_columns, unique_ids
+from app.model.frame import MAX_METRES
+from app.model.layers import NETWORK, Layers, PartKey
+
+NAME = "ffr_network"
+FILE = "network.ffr.yaml"
+POINTS, LINES = "internal_points", "network_lines"
+DECIMALS = 6
+"""Coordinates that agree to a micrometre are the same place."""
+
+AXES = ("x", "y", "z")
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+def read(files: Files, context: ReadContext) -> Layers:
+    """The network as topology. Raises UnreadableFile naming the point or line."""
+    if not context.wants("topology"):
+        return Layers()
+    main = context.main or next(iter(files))
+    top = _yaml.load(files[main], context.limits)
+    if not isinstance(top, dict) or not isinstance(top.get(POINTS), list):
+        reason = f"an FFR network is a mapping with a list of {POINTS}"
+        raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where=POINTS)])
+    names, xyz, high, rests = _points(top[POINTS])
+    if again := without_repeats(names):
+        context.warn(f"{len(again)} names stand twice or more: {some(again)}")
+    place: dict[tuple[float, float], int] = {}
+    crowded = []
+    for k, (x, y) in enumerate(xyz[:, :2].tolist()):
+        if place.setdefault(_spot(x, y), k) != k:
+            crowded.append(names[k])
+    if crowded:
+        context.warn(f"{len(crowded)} points stand where another one does: {some(crowded)}; lines go to the first")
+    found, dangling = _lines(top.get(LINES), place, context)
+    warn_lonely(len(names), (k for line in found for k in (line.a, line.b)), names, context)
+    ids = unique_ids(map(identifier, names))
+    properties: list[Properties] = []
+    for i, name, rest, is_high in zip(ids, names, rests, high, strict=True):
+        said: dict[str, Any] = {"more": rest} if rest else {}
+        if i != name:
+            said["name"] = name
+        if is_high:
+            said["z"] = True
+        properties.append({"kind": "node", "name": name, NAME: said})
+    edge_ids, shapes, edge_properties = edges(found, ids, xyz, NAME)
+    rest = {key: value for key, value in top.items() if key not in (POINTS, LINES)}
+    document = ({"top": rest} if rest else {}) | ({"dangling": dangling} if dangling else {})
+    geometry = np.empty(len(ids) + len(shapes), object)
+    geometry[:] = [*node_points(xyz), *shapes]
+    part = from_columns([*ids, *edge_ids], geometry, [*properties, *edge_properties], "local", {NAME: document})
+    return Layers({PartKey("topology", context.level, NETWORK): part})
+
+
+def _spot(x: float, y: float) -> tuple[float, float]:
+    return round(x, DECIMALS) + 0.0, round(y, DECIMALS) + 0.0
+
+
+def _points(said: Sequence[Any]) -> tuple[list[str], Array, list[bool], list[dict[str, Any]]]:
+    """(names, float64 [n, 3] metres, whether a z stands there, further keys)."""
+    names, rows, high, rests = [], [], [], []
+    for k, point in enumerate(said):
+        where = f"{POINTS}[{k}]"
+        if not isinstance(point, dict):
+            refuse("a point is a mapping with name, x and y", where)
+        name = point.get("name")
+        if isinstance(name, bool) or not isinstance(name, (int, float, str)):
+            refuse("a point must have a name", f"{where}.name")
+        names.append(checked_name(name if isinstance(name, str) else _yaml.text(name), f"{where}.name"))
+        rows.append((*_xy(point, where), number(point.get("z", 0.0), f"{where}.z")))
+        high.append("z" in point)
+        rests.append({key: value for key, value in point.items() if key not in ("name", *AXES)})
+    return names, np.array(rows, np.float64).reshape(-1, 3), high, rests
+
+
+def _xy(said: Any, where: str) -> tuple[float, float]:
+    if not isinstance(said, dict):
+        refuse("must be a mapping with x and y", where)
+    x, y = (number(said.get(axis), f"{where}.{axis}") for axis in "xy")
+    if max(abs(x), abs(y)) > MAX_METRES:
+        refuse(f"coordinates must lie within ±{MAX_METRES:g} m", where)
+    return x, y
+
+
+def _lines(
+    said: Any, place: Mapping[tuple[float, float], int], context: ReadContext
+) -> tuple[list[Line], list[dict[str, Any]]]:
+    """(lines between points; those that end at none, as they stand)."""
+    if said is not None and not isinstance(said, list):
+        refuse("must be a list", LINES)
+    found, dangling = [], []
+    for k, line in enumerate(said or ()):
+        where = f"{LINES}[{k}]"
+        if not isinstance(line, dict):
+            refuse("a line is a mapping with start and end", where)
+        ends = [_xy(line.get(word), f"{where}.{word}") for word in ("start", "end")]
+        spots = [place.get(_spot(*end)) for end in ends]
+        if spots[0] is None or spots[1] is None:
+            x, y = ends[0] if spots[0] is None else ends[1]
+            reason = f"no point stands at its end x {x:g}, y {y:g}: it is kept, but is no part of the network"
+            context.warn(reason, where=where)
+            dangling.append(line)
+            continue
+        if spots[0] == spots[1]:
+            context.warn("it ends where it starts", where=where)
+        rest = {key: value for key, value in line.items() if key not in ("start", "end")}
+        for word in ("start", "end"):
+            more = {key: value for key, value in line[word].items() if key not in "xy"}
+            if more:
+                rest[word] = more
+        found.append(Line(spots[0], spots[1], rest))
+    return found, dangling
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``network.ffr.yaml``: all networks as one, points by length and text of their names, lines by their points.
+
+    Edges of both directions between two nodes are one line. MissingDatum for wgs84 items without a datum.
+    """
+    net = joined(layers, context)
+    order = sorted(range(len(net.nodes)), key=lambda k: natural(net.nodes[k].id))
+    if len(set(net.levels)) > 1:
+        context.drop("levels of nodes", len(net.nodes), "all networks are joined into one")
+    document = known_document(layers, NAME)
+    xy = np.array([(n.x, n.y) for n in net.nodes], np.float64).reshape(-1, 2)
+    said_xy = list(map(_yaml.decimal, numbers(xy.ravel(), METRES)))
+    at = list(zip(said_xy[::2], said_xy[1::2], strict=True))
+    spots = [_spot(x, y) for x, y in xy.tolist()]
+    if len(set(spots)) < len(spots):
+        reason = "nodes stand where another one does: their lines will be taken for the other's"
+        context.warn(f"{len(spots) - len(set(spots))} {reason}")
+    top = document.get("top")
+    top = {key: v for key, v in top.items() if key not in (POINTS, LINES)} if isinstance(top, dict) else {}
+    out = [_yaml.mapping(top, 0)] if top else []
+    out.append(f"{POINTS}:\n" if order else f"{POINTS}: []\n")
+    lost = unnamed = 0
+    for k in order:
+        node = net.nodes[k]
+        p, its = node.properties, own(node.properties, NAME)
+        name = its.get("name")
+        name = name if isinstance(name, str) and is_name(name) else node.id
+        more = its.get("more")
+        said = {key: v for key, v in more.items() if key not in ("name", *AXES)} if isinstance(more, dict) else {}
+        unnamed += isinstance(p.get("name"), str) and p["name"] not in ("", name)
+        lost += bool(p.keys() - NODE_CANONICAL - {NAME})
+        text = f"- name: {_yaml.text(name)}\n  x: {at[k][0]}\n  y: {at[k][1]}\n"
+        if node.z or its.get("z") is True:
+            text += f"  z: {_yaml.decimal(numbers([node.z or 0.0], METRES)[0])}\n"
+        out.append(f"{text}{_yaml.mapping(said, 2) if said else ''}")
+    context.drop("attributes of nodes", lost, "the format has no place for them")
+    context.drop("names of nodes that are not their ids", unnamed, "a point's name is its node's id")
+    ranks = {k: rank for rank, k in enumerate(order)}
+    told = []
+    for line in sorted(lines(net, context, NAME), key=lambda one: (ranks[one.a], ranks[one.b])):
+        ends = (_end("start", line.said, at[line.a]), _end("end", line.said, at[line.b]))
+        rest = {key: value for key, value in line.said.items() if key not in ("start", "end")}
+        told.append(f"- {ends[0]}  {ends[1]}{_yaml.mapping(rest, 2) if rest else ''}")
+    kept = document.get("dangling")
+    kept = [one for one in kept if isinstance(one, dict) and one] if isinstance(kept, list) else []
+    told += [f"- {_yaml.mapping(one, 2)[2:]}" for one in kept]
+    out += [f"{LINES}:\n", *told] if told else [f"{LINES}: []\n"]
+    return {FILE: "".join(out).encode()}
+
+
+def _end(word: str, said: Mapping[str, Any], at: tuple[str, str]) -> str:
+    more = said.get(word)
+    rest = {key: value for key, value in more.items() if key not in "xy"} if isinstance(more, dict) else {}
+    return f"{word}:\n    x: {at[0]}\n    y: {at[1]}\n{_yaml.mapping(rest, 4) if rest else ''}"
+
+
+# --- telling ---------------------------------------------------------------------------------------------------------
+_POINTS = re.compile(rb"(?m)^[\"']?internal_points[\"']?[ \t]*:")
+_LINES = re.compile(rb"(?m)^[\"']?network_lines[\"']?[ \t]*:")
+
+
+def detect(name: str, data: bytes) -> bool:
+    """YAML with both lists at the top."""
+    del name
+    return b"network_lines" in data and bool(_POINTS.search(data) and _LINES.search(data))
+
+
+register(
+    Format(
+        name=NAME,
+        title="FFR network (environment_common)",
+        files=(FILE,),
+        media_types=("application/yaml",),
+        carries=frozenset({"topology"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        family=NAME,
+        rank=34,
+        extensions=(".ffr.yaml", ".yaml", ".yml"),
+    )
+)

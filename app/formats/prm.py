@@ -1,0 +1,441 @@
+"""prm: the probabilistic roadmap that environment_common makes of a map's picture, as YAML.
+
+``nodes``: ``{id, x, y}``, whole pixels of the picture, x from its left, y from its *top*; ``edges``: ``{from, to,
+weight}`` between ids, in both directions, the weight being their distance in pixels. Source: environment_common,
+convertors/metric_to_prm.py, which writes ``topological/prm_autogen.yaml`` from ``metric/map/map.yaml``.
+
+A pixel is a place only with its picture: we write ``picture`` ({resolution, origin, height}, our own word) beside the
+two lists. Without it the map's YAML and picture are looked up in the upload (``metric/map/`` of an
+environment_template, else beside the roadmap, else the only map.yaml), or options say all three. A node stands at the
+centre of its pixel, metres in the local frame. On writing pixels are those of the stored grid ``map``, else of the
+picture that the roadmap came with, else of a picture that would just hold the network.
+
+Canonical: a node's id is its ``id`` as a text, an edge's ``<from>-<to>``; see ``_twoway`` for edges of both directions.
+``properties.prm`` holds ``more`` (further keys) and ``id`` where it is no whole number; the document's ``prm`` holds
+``picture`` ({resolution, origin, height}), ``top`` (further keys of the file) and ``dangling`` (edges to nowhere).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from app.errors import FleetMapError, Problem, UnreadableFile
+from app.formats import BAD_INPUT, Files, Format, Needs, ReadContext, WriteContext, _image, _yaml, register
+from app.formats._network import (
+    Array,
+    Net,
+    checked_name,
+    identifier,
+    is_name,
+    joined,
+    known_document,
+    natural,
+    node_points,
+    number,
+    only_2d,
+    own,
+    refuse,
+    some,
+    without_repeats,
+)
+from app.formats._twoway import NODE_CANONICAL, Line, canonical, edges, lines, warn_lonely
+from app.model.features import Properties, from_columns, unique_ids
+from app.model.frame import GROUND, MAX_METRES
+from app.model.grid import OccupancyGrid
+from app.model.layers import MAP, NETWORK, Layers, PartKey
+from app.parameters import parameter
+
+NAME = "prm"
+FILE = "prm.yaml"
+PICTURE = "picture"
+OWN_KEYS = ("nodes", "edges", PICTURE)
+WHOLE = 1e-4
+"""A pixel this near to a whole one is that one: metres are kept to a nanometre."""
+
+RESOLUTION = 0.05
+"""Metres a pixel of a picture that is made up: the usual one."""
+
+MARGIN = 1.0
+"""Metres around the network in a picture that is made up."""
+
+MAPS = ("map.yaml", "map.yml", "map_autogen.yaml")
+PICTURES = (".pgm", ".png", ".bmp", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """The picture that the pixels belong to, for a roadmap that comes without its map."""
+
+    resolution: float | None = parameter(
+        None, "size of a pixel of the map's picture, for a roadmap without its map", minimum=1e-6, maximum=1e4, unit="m"
+    )
+    origin: tuple[float, float, float] = parameter(
+        (0.0, 0.0, 0.0), "x,y,yaw of the picture's lower left corner (metres, radians), for a roadmap without its map"
+    )
+    height: int | None = parameter(
+        None, "rows of the map's picture, for a roadmap without its map", minimum=1, maximum=2**31
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """Where the pixels of a picture lie: metres a pixel, (x, y, yaw) of the lower left corner, rows."""
+
+    resolution: float
+    origin: tuple[float, float, float]
+    height: int
+
+    def metres(self, pixels: Array) -> Array:
+        """Centres of pixels [n, 2] (x from the left, y from the top) -> metres [n, 2]."""
+        x, y, yaw = self.origin
+        u = (pixels[:, 0] + 0.5) * self.resolution
+        v = (self.height - 0.5 - pixels[:, 1]) * self.resolution
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        return np.stack([x + cos * u - sin * v, y + sin * u + cos * v], axis=1)
+
+    def pixels(self, metres: Array) -> Array:
+        """The reverse of ``metres``: not rounded."""
+        x, y, yaw = self.origin
+        dx, dy = metres[:, 0] - x, metres[:, 1] - y
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        u, v = (cos * dx + sin * dy) / self.resolution, (cos * dy - sin * dx) / self.resolution
+        return np.stack([u - 0.5, self.height - 0.5 - v], axis=1)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the document."""
+        return {"resolution": self.resolution, "origin": list(self.origin), "height": self.height}
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+def read(files: Files, context: ReadContext) -> Layers:
+    """The roadmap as topology. Raises UnreadableFile naming the node, or what to supply where the map is unknown."""
+    if not context.wants("topology"):
+        return Layers()
+    main = context.main or next(iter(files))
+    top = _yaml.load(files[main], context.limits)
+    if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
+        reason = "a roadmap is a mapping with a list of nodes"
+        raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="nodes")])
+    picture = _picture(top.get(PICTURE), files, main, context)
+    names, pixels, rests = _nodes(top["nodes"])
+    if again := without_repeats(names):
+        context.warn(f"{len(again)} ids stand twice or more: {some(again)}; edges to them go to the first")
+    if len(pixels) and (pixels.min() < -0.5 or pixels[:, 1].max() > picture.height - 0.5):
+        context.warn(f"some nodes lie outside the map's picture ({picture.height} rows)")
+    place = {name: k for k, name in reversed(list(enumerate(names)))}
+    ids = unique_ids(map(identifier, names))
+    xyz = np.concatenate([picture.metres(pixels), np.zeros((len(names), 1))], axis=1)
+    if len(xyz) and np.abs(xyz).max() > MAX_METRES:
+        refuse(f"nodes must lie within ±{MAX_METRES:g} m", "nodes")
+    found, dangling = _edges(top.get("edges"), place, context)
+    warn_lonely(len(names), (k for line in found for k in (line.a, line.b)), names, context)
+    properties: list[Properties] = []
+    for i, name, rest in zip(ids, names, rests, strict=True):
+        known = canonical(("name",), rest)
+        more = {key: value for key, value in rest.items() if key not in known and key != "id"}
+        said: dict[str, Any] = {"more": more} if more else {}
+        if "id" in rest or name != i:
+            said["id"] = rest.get("id", name)
+        properties.append({"kind": "node", **known, NAME: said})
+    edge_ids, shapes, edge_properties = edges(found, ids, xyz, NAME)
+    document: dict[str, Any] = {"picture": picture.as_dict()}
+    rest = {key: value for key, value in top.items() if key not in OWN_KEYS}
+    document |= ({"top": rest} if rest else {}) | ({"dangling": dangling} if dangling else {})
+    geometry = np.empty(len(ids) + len(shapes), object)
+    geometry[:] = [*node_points(xyz), *shapes]
+    part = from_columns([*ids, *edge_ids], geometry, [*properties, *edge_properties], "local", {NAME: document})
+    return Layers({PartKey("topology", context.level, NETWORK): part})
+
+
+def _picture(said: Any, files: Files, main: str, context: ReadContext) -> _Picture:
+    """What the options say, else the file itself, else the map beside it."""
+    options = context.options if isinstance(context.options, ReadOptions) else ReadOptions()
+    if options.resolution is not None and options.height is not None:
+        _check_origin(options.origin, main)
+        return _Picture(options.resolution, options.origin, options.height)
+    if said is not None:
+        return _picture_said(said)
+    for name in looks_at(main, list(files)):
+        if not name.lower().endswith((".yaml", ".yml")):
+            continue
+        try:
+            beside = _yaml.load(files[name], context.limits)
+            base = re.split(r"[/\\]", str(beside["image"]))[-1]
+            image = files[f"{name.rpartition('/')[0]}/{base}".lstrip("/")]
+            rows = _image.size_of(image, context.limits)[1]
+            return _picture_said({**beside, "height": rows})
+        except (*BAD_INPUT, FleetMapError):  # the map's own reader says what is wrong with it
+            continue
+    reason = (
+        "the nodes are pixels of a map's picture: add that map (map.yaml and its picture) to the upload, or the "
+        "options resolution, origin and height"
+    )
+    raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main, where="nodes")])
+
+
+def _picture_said(said: Any) -> _Picture:
+    """A mapping's resolution, origin and height, checked."""
+    if not isinstance(said, dict):
+        refuse("must be a mapping with resolution, origin and height", PICTURE)
+    origin, height = said.get("origin"), said.get("height")
+    if not isinstance(origin, list) or len(origin) != 3:
+        refuse("must be [x, y, yaw]", f"{PICTURE}.origin")
+    if isinstance(height, bool) or not isinstance(height, int) or not 1 <= height <= 2**31:
+        refuse("must be a whole number above 0", f"{PICTURE}.height")
+    resolution = number(said.get("resolution"), f"{PICTURE}.resolution")
+    if not 1e-6 <= resolution <= 1e4:
+        refuse("must be between 1e-6 and 1e4 metres", f"{PICTURE}.resolution")
+    x, y, yaw = (number(v, f"{PICTURE}.origin") for v in origin)
+    if max(map(abs, (x, y, yaw))) > MAX_METRES:
+        refuse(f"must lie within ±{MAX_METRES:g}", f"{PICTURE}.origin")
+    return _Picture(resolution, (x, y, yaw), height)
+
+
+def _check_origin(origin: Sequence[float], file: str) -> None:
+    if not all(math.isfinite(v) and abs(v) <= MAX_METRES for v in origin):
+        reason = f"origin must be three numbers within ±{MAX_METRES:g}"
+        raise UnreadableFile(f"{file}: {reason}", [Problem(reason, file, where="origin")])
+
+
+def looks_at(main: str, names: Sequence[str]) -> Iterable[str]:
+    """Maps of the upload that the pixels may belong to, the likeliest first, and the pictures beside them."""
+    folder = main.rpartition("/")[0]
+    root = folder.rpartition("/")[0] if folder.rpartition("/")[2] == "topological" else None
+    likely = [] if root is None else [f"{root}/metric/map".lstrip("/")]
+    folders = dict.fromkeys([*likely, folder])
+    found = [f"{f}/{m}".lstrip("/") for f in folders for m in MAPS]
+    known = set(names)
+    found = [n for n in found if n in known]
+    if not found:
+        every = [n for n in sorted(known) if n.rpartition("/")[2] in MAPS]
+        found = every if len({n.rpartition("/")[0] for n in every}) == 1 else []
+    homes = {n.rpartition("/")[0] for n in found}
+    pictures = [n for n in sorted(known) if n.rpartition("/")[0] in homes and n.lower().endswith(PICTURES)]
+    return [*(n for n in found if n != main), *pictures]
+
+
+def _nodes(said: Sequence[Any]) -> tuple[list[str], Array, list[dict[str, Any]]]:
+    """(ids as texts, float64 [n, 2] pixels, further keys; ``id`` among them where it is no whole number)."""
+    names, rows, rests = [], [], []
+    for k, node in enumerate(said):
+        where = f"nodes[{k}]"
+        if not isinstance(node, dict):
+            refuse("a node is a mapping with id, x and y", where)
+        rest = {key: value for key, value in node.items() if key not in ("id", "x", "y")}
+        names.append(_id(node.get("id"), f"{where}.id"))
+        if not isinstance(node["id"], int):
+            rest["id"] = node["id"]
+        rows.append((number(node.get("x"), f"{where}.x"), number(node.get("y"), f"{where}.y")))
+        if max(map(abs, rows[-1])) > 1e12:
+            refuse("a pixel this far away is of no picture", where)
+        rests.append(rest)
+    return names, np.array(rows, np.float64).reshape(-1, 2), rests
+
+
+def _id(said: Any, where: str) -> str:
+    if isinstance(said, bool) or not isinstance(said, (int, float, str)):
+        refuse("an id is a number or a text", where)
+    return checked_name(said if isinstance(said, str) else _yaml.text(said), where)
+
+
+def _edges(said: Any, place: Mapping[str, int], context: ReadContext) -> tuple[list[Line], list[dict[str, Any]]]:
+    """(edges between nodes; those to nowhere as they stand)."""
+    if said is not None and not isinstance(said, list):
+        refuse("must be a list", "edges")
+    found, dangling = [], []
+    for k, edge in enumerate(said or ()):
+        where = f"edges[{k}]"
+        if not isinstance(edge, dict):
+            refuse("an edge is a mapping with from and to", where)
+        ends = [_id(edge.get(word), f"{where}.{word}") for word in ("from", "to")]
+        lost = [end for end in ends if end not in place]
+        if lost:
+            context.warn(f"there is no node {lost[0]!r}: the edge is kept, but is no part of the network", where=where)
+            dangling.append(edge)
+            continue
+        if ends[0] == ends[1]:
+            context.warn(f"{ends[0]} is joined with itself", where=where)
+        rest = {key: value for key, value in edge.items() if key not in ("from", "to")}
+        if "weight" in rest:
+            number(rest["weight"], f"{where}.weight")
+        found.append(Line(place[ends[0]], place[ends[1]], rest))
+    return found, dangling
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``prm.yaml``: all networks as one roadmap, nodes by length and text of their ids, edges by their nodes.
+
+    Nodes of other formats are moved to the centres of their pixels, and numbered where their ids are no whole numbers
+    (the id becomes the ``name``). MissingDatum for wgs84 items without a datum.
+    """
+    net = joined(layers, context)
+    only_2d(net, context, "pixels have no altitude and no level")
+    net = _sorted(net)
+    document = known_document(layers, NAME)
+    xy = np.array([(n.x, n.y) for n in net.nodes], np.float64).reshape(-1, 2)
+    picture = _picture_of(layers, document, xy, context)
+    exact = picture.pixels(xy)
+    near = np.round(exact)
+    own_nodes = np.array([NAME in n.properties for n in net.nodes], bool)
+    whole = (np.abs(exact - near) <= WHOLE).all(axis=1) if len(exact) else np.empty(0, bool)
+    moved = int((~whole & ~own_nodes).sum())
+    context.drop("places of nodes within their pixels", moved, f"pixels of {picture.resolution:g} m are whole numbers")
+    # The pixel that holds the place, its left and lower edge included; a roadmap's own broken pixels stay broken.
+    inside = np.stack([np.floor(exact[:, 0] + 0.5 + WHOLE), np.ceil(exact[:, 1] - 0.5 - WHOLE)], axis=1)
+    pixels = np.where(whole[:, None], near, np.where(own_nodes[:, None], np.round(exact, 6), inside))
+    ids = _ids(net)
+    top = document.get("top")
+    top = {key: v for key, v in top.items() if key not in OWN_KEYS} if isinstance(top, dict) else {}
+    out = [_yaml.mapping(top, 0)] if top else []
+    out.append("nodes:\n" if net.nodes else "nodes: []\n")
+    lost = renamed = 0
+    for k, (node, i) in enumerate(zip(net.nodes, ids, strict=True)):
+        p = node.properties
+        more = own(p, NAME).get("more")
+        said = {key: v for key, v in more.items() if key not in ("id", "x", "y")} if isinstance(more, dict) else {}
+        called = p.get("name")
+        if isinstance(called, str) and called:
+            said["name"] = called
+        elif str(i) != node.id and NAME not in p:
+            said["name"] = node.id
+        renamed += str(i) != node.id and NAME not in p
+        lost += bool(p.keys() - NODE_CANONICAL - {NAME})
+        x, y = (_yaml.text(_plain(v)) for v in pixels[k].tolist())
+        out.append(f"- id: {_yaml.text(i)}\n  x: {x}\n  y: {y}\n{_yaml.mapping(said, 2) if said else ''}")
+    context.drop("attributes of nodes", lost, "the format has no place for them")
+    if renamed:
+        context.warn(f"{renamed} nodes got a number for an id; their own one is their name, where they had none")
+    weighed = 0
+    told = []
+    for line in lines(net, context, NAME):
+        said = {key: v for key, v in line.said.items() if key not in ("from", "to")}
+        if not isinstance(said.get("weight"), (int, float)):
+            a, b = pixels[line.a], pixels[line.b]
+            said["weight"] = round(float(np.hypot(*(a - b))), 9)
+            weighed += 1
+        told.append(_edge(ids[line.a], ids[line.b], said))
+    kept = document.get("dangling")
+    kept = [e for e in kept if isinstance(e, dict) and {"from", "to"} <= e.keys()] if isinstance(kept, list) else []
+    told += [_edge(e["from"], e["to"], {k: v for k, v in e.items() if k not in ("from", "to")}) for e in kept]
+    if weighed:
+        context.fill("edges: weight", "distance in pixels", f"{weighed} edges come from a format that does not say it")
+    out += ["edges:\n", *told] if told else ["edges: []\n"]
+    out.append(_yaml.mapping({PICTURE: picture.as_dict()}, 0))
+    return {FILE: "".join(out).encode()}
+
+
+def _edge(a: Any, b: Any, said: dict[str, Any]) -> str:
+    weight = f"  weight: {_yaml.text(said['weight'])}\n" if isinstance(said.get("weight"), (int, float)) else ""
+    rest = {key: value for key, value in said.items() if key != "weight" or not weight}
+    ends = f"- from: {_yaml.text(a)}\n  to: {_yaml.text(b)}\n"
+    return f"{ends}{weight}{_yaml.mapping(rest, 2) if rest else ''}"
+
+
+def _plain(value: float) -> float:
+    return int(value) if float(value).is_integer() else value
+
+
+def _sorted(net: Net) -> Net:
+    """The same with nodes in the order of their ids."""
+    order = sorted(range(len(net.nodes)), key=lambda k: natural(net.nodes[k].id))
+    place = {old: new for new, old in enumerate(order)}
+    moved = [type(e)(e.id, place[e.source], place[e.target], e.properties, e.geometry, e.level) for e in net.edges]
+    return Net([net.nodes[k] for k in order], moved, net.levels)
+
+
+_WHOLE_NUMBER = re.compile(r"(?:0|[1-9][0-9]{0,17})\Z", re.ASCII)
+
+
+def _ids(net: Net) -> list[Any]:
+    """The ids as the file says them: whole numbers and a roadmap's own texts; the others get free numbers."""
+    out: list[Any] = []
+    for node in net.nodes:
+        said = own(node.properties, NAME).get("id")
+        keep = isinstance(said, (int, float)) or (isinstance(said, str) and is_name(said))
+        if keep and not isinstance(said, bool):
+            out.append(said)
+        elif _WHOLE_NUMBER.match(node.id):
+            out.append(int(node.id))
+        else:
+            out.append(None)
+    taken = {i for i in out if isinstance(i, int)}
+    free = 0
+    for k, i in enumerate(out):
+        if i is None:
+            while free in taken:
+                free += 1
+            out[k] = free
+            free += 1
+    return out
+
+
+def _picture_of(layers: Layers, document: Mapping[str, Any], xy: Array, context: WriteContext) -> _Picture:
+    """The picture whose pixels are written."""
+    grids = layers.grids()
+    chosen = choose(sorted(grids), None)
+    if chosen:
+        grid: OccupancyGrid = grids[chosen[0]]
+        return _Picture(grid.resolution, grid.origin, grid.height)
+    known = document.get("picture")
+    if isinstance(known, dict):
+        with contextlib.suppress(UnreadableFile):  # a document may be edited
+            return _picture_said(known)
+    low = np.floor(xy.min(axis=0) - MARGIN) if len(xy) else np.zeros(2)
+    high = np.ceil(xy.max(axis=0) + MARGIN) if len(xy) else np.ones(2)
+    rows = max(1, math.ceil((high[1] - low[1]) / RESOLUTION))
+    made = _Picture(RESOLUTION, (float(low[0]), float(low[1]), 0.0), rows)
+    context.fill("picture: resolution, origin, height", made.as_dict(), "no map's picture is known")
+    return made
+
+
+def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
+    """The networks, and the grid whose pixels they are given in: ``map``, else the only one; on the ground first."""
+    grids = [key for key in keys if key.layer == "occupancy"]
+    names = {key.name for key in grids}
+    grids = [key for key in grids if key.name == MAP or len(names) == 1]
+    grids.sort(key=lambda key: (key.level != GROUND, key))
+    return [*(key for key in keys if key.layer == "topology"), *grids[:1]]
+
+
+# --- telling ---------------------------------------------------------------------------------------------------------
+_NODES = re.compile(rb"(?m)^nodes[ \t]*:[ \t]*\r?\n[ \t]*- +\{?(?:id|x|y)[ \t]*:")
+_EDGES = re.compile(rb"(?m)^edges[ \t]*:")
+_EDGE = re.compile(rb"[\s{,](?:from|to)[ \t]*:")
+
+
+def detect(name: str, data: bytes) -> bool:
+    """YAML with a list of nodes that begin with id, x or y, and with edges from and to."""
+    if not name.lower().endswith((".yaml", ".yml")) or not _NODES.search(data[: 2**16]):
+        return False
+    found = _EDGES.search(data)
+    return bool(found and (_EDGE.search(data, found.end()) or re.match(rb"[ \t]*\[\]", data[found.end() :][:8])))
+
+
+register(
+    Format(
+        name=NAME,
+        title="Probabilistic roadmap (environment_common)",
+        files=(FILE,),
+        media_types=("application/yaml",),
+        carries=frozenset({"topology", "occupancy"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"occupancy"})),
+        looks_at=looks_at,
+        read_options=ReadOptions,
+        family=NAME,
+        rank=3,
+        extensions=(".yaml", ".yml"),
+        choose=choose,
+        outlines=True,
+    )
+)

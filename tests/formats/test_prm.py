@@ -1,0 +1,205 @@
+"""prm: pixels of a map's picture are places in metres and back, edges of both directions, nothing lost."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import yaml
+
+from app import formats
+from app.bundle import Hints, Known
+from app.bundle import read as read_bundle
+from app.convert import offline
+from app.errors import BadUpload, Invalid, UnreadableFile
+from app.formats import Group, Limits, ReadContext, WriteContext, get_format
+from app.model.features import Features, features
+from app.model.grid import OccupancyGrid
+from app.model.layers import Layers, PartKey
+
+FORMAT = get_format("prm")
+SAMPLE = Path(__file__).resolve().parents[1] / "samples" / "prm"
+MEADOW = {p.name: p.read_bytes() for p in (SAMPLE / "meadow").iterdir()}
+NETWORK = PartKey("topology", "ground", "network")
+Edges = set[tuple[str, str]]
+
+
+def read(files: dict[str, bytes], **options: str) -> tuple[Features, Any]:
+    told = read_bundle(files, Hints(options=options), Known(), Limits())
+    part = told.parts[NETWORK]
+    assert isinstance(part, Features)
+    return part, told
+
+
+def write(layers: Layers) -> tuple[dict[str, Any], WriteContext]:
+    context = WriteContext()
+    files = formats.write(FORMAT, layers, context)
+    assert list(files) == ["prm.yaml"]
+    return yaml.safe_load(files["prm.yaml"]), context
+
+
+def nodes(part: Features) -> dict[str, list[float]]:
+    pairs = zip(part.ids, part.geometry, part.properties, strict=True)
+    return {i: [g.x, g.y] for i, g, p in pairs if p["kind"] == "node"}
+
+
+def edges(part: Features) -> Edges:
+    return {(p["source"], p["target"]) for p in part.properties if p["kind"] == "edge"}
+
+
+def seeds_own(picture: tuple[int, int], count: int) -> tuple[bytes, list[dict[str, Any]], list[dict[str, Any]]]:
+    """What metric_to_prm.generate_prm dumps: integer pixels, an undirected graph, PyYAML's block style."""
+    dice = np.random.default_rng(3)
+    at = [(int(dice.integers(picture[0])), int(dice.integers(picture[1]))) for _ in range(count)]
+    told = [{"id": k, "x": x, "y": y} for k, (x, y) in enumerate(at)]
+    graph = [
+        {"from": a, "to": b, "weight": float(math.dist(at[a], at[b]))}
+        for a in range(count)
+        for b in range(a + 1, count)
+        if math.dist(at[a], at[b]) < 60
+    ]
+    return yaml.dump({"nodes": told, "edges": graph}, sort_keys=False).encode(), told, graph
+
+
+def test_facts_of_our_sample() -> None:
+    fact = json.loads((SAMPLE / "facts.json").read_text())["meadow"]
+    part, told = read(MEADOW)
+    assert nodes(part) == fact["nodes"]
+    assert len(edges(part)) == fact["edges"]
+    assert edges(part) == {("0", "1"), ("1", "0"), ("0", "2"), ("2", "0"), ("1", "2"), ("2", "1")}
+    said = "\n".join(w.problem for w in told.warnings)
+    assert "'77'" in said
+    assert "no lines: 10" in said
+    assert {k.layer for k in told.parts} == {"topology", "occupancy"}
+    assert told.files["map.pgm"].format == "occupancy_grid"
+    assert told.origin[NETWORK] == (("prm.yaml",), "prm")
+
+
+def test_a_file_as_the_seed_writes_it_comes_back_the_same() -> None:
+    data, told, graph = seeds_own((200, 120), 300)
+    assert formats.detect("prm_autogen.yaml", data) is FORMAT
+    files = {
+        "config/topological/prm_autogen.yaml": data,
+        "config/metric/map/map.yaml": MEADOW["map.yaml"].replace(b"0.0]", b"0.3]"),
+        "config/metric/map/map.pgm": b"P5\n200 120\n255\n" + b"\xfe" * 24000,
+        "config/metric/nogo/map.yaml": MEADOW["map.yaml"].replace(b"0.5", b"7.0"),
+        "config/metric/nogo/map.pgm": MEADOW["map.pgm"],
+    }
+    part, _ = read(files)
+    # The first node by hand: the centre of its pixel, turned by the yaw about the lower left corner.
+    u, v = (told[0]["x"] + 0.5) * 0.5, (120 - told[0]["y"] - 0.5) * 0.5
+    x, y = -2.0 + u * math.cos(0.3) - v * math.sin(0.3), 10.0 + u * math.sin(0.3) + v * math.cos(0.3)
+    assert np.allclose(nodes(part)["0"], [x, y], rtol=0, atol=1e-9)
+    served = offline(files, "prm").files["prm.yaml"]
+    back = yaml.safe_load(served)
+    assert back["nodes"] == told
+    assert all(type(n["x"]) is int for n in back["nodes"])
+    assert sorted(back["edges"], key=lambda e: (e["from"], e["to"])) == graph
+    assert back["picture"] == {"height": 120, "origin": [-2.0, 10.0, 0.3], "resolution": 0.5}
+    assert offline({"prm.yaml": served}, "prm").files["prm.yaml"] == served, "it stands for itself now"
+
+
+def test_everything_that_a_file_says_comes_back() -> None:
+    data = b"""seed: 7
+nodes:
+- {id: b-1, x: 1, y: 2, name: Dock}
+- {id: 4, x: 2.5, y: 2}
+- {id: 1.5, x: 0, y: 0, tags: [a, {b: null}]}
+edges:
+- {from: b-1, to: 4, weight: 9, speed_limit: 1.5}
+- {from: 4, to: b-1, weight: 2}
+- {from: 4, to: 4}
+- {from: 1.5, to: b-1, oneway: true, weight: 2}
+- {from: 1.5, to: nowhere, weight: 1}
+picture: {resolution: 0.1, origin: [0, 0, 0], height: 50}
+"""
+    part, _ = read({"p.yaml": data})
+    assert nodes(part) == {
+        "b-1": pytest.approx([0.15, 4.75]),
+        "4": pytest.approx([0.3, 4.75]),
+        "1.5": pytest.approx([0.05, 4.95]),
+    }
+    assert [p.get("name") for p in part.properties[:3]] == ["Dock", None, None]
+    assert part.properties[3]["speed_limit"] == 1.5
+    assert ("1.5", "b-1") in edges(part)
+    assert ("b-1", "1.5") not in edges(part)
+    once, now = yaml.safe_load(data), yaml.safe_load(offline({"p.yaml": data}, "prm").files["prm.yaml"])
+    assert {k: v for k, v in now.items() if k not in ("nodes", "edges")} == {
+        k: v for k, v in once.items() if k not in ("nodes", "edges")
+    }
+    key = str
+    assert sorted(now["nodes"], key=key) == sorted(once["nodes"], key=key)
+    once["edges"][2]["weight"] = 0.0  # the distance, where none was said
+    assert sorted((sorted(e.items()) for e in now["edges"]), key=key) == sorted(
+        (sorted(e.items()) for e in once["edges"]), key=key
+    )
+
+
+def test_a_network_from_elsewhere_gets_pixels_of_the_stored_map() -> None:
+    rows: list[tuple[str, Any, dict[str, Any]]] = [
+        ("gate", shapely.Point(1.01, 2.0), {"kind": "node", "orientation": [0, 0, 0, 1]}),
+        ("0", shapely.Point(3.0, 4.0), {"kind": "node", "name": "Barn"}),
+        ("e1", shapely.LineString([(1, 2), (3, 4)]), {"kind": "edge", "source": "gate", "target": "0"}),
+    ]
+    network = features(rows, "local")
+    grid = OccupancyGrid(np.zeros((100, 80), np.uint8), 0.1, (-1.0, -2.0, 0.0))
+    layers = Layers({NETWORK: network, PartKey("occupancy", "ground", "map"): grid})
+    told, context = write(layers)
+    assert told["nodes"] == [{"id": 0, "x": 40, "y": 39, "name": "Barn"}, {"id": 1, "x": 20, "y": 59, "name": "gate"}]
+    assert told["edges"] == [{"from": 1, "to": 0, "weight": round(math.hypot(20, 20), 9), "oneway": True}]
+    assert any("one way" in w.problem for w in context.warnings)
+    assert {d["what"]: d["count"] for d in context.dropped} == {
+        "places of nodes within their pixels": 2,
+        "attributes of nodes": 1,
+    }
+    assert [t["what"] for t in context.template] == ["edges: weight"]
+    alone, context = write(Layers({NETWORK: network}))
+    assert alone["picture"] == {"resolution": 0.05, "origin": [0.0, 1.0, 0.0], "height": 80}
+    assert "picture: resolution, origin, height" in [t["what"] for t in context.template]
+    again, _ = read({"prm.yaml": yaml.safe_dump(alone).encode()})
+    assert np.allclose(nodes(again)["0"], [3.0, 4.0], atol=0.05)
+
+
+def test_without_its_map_it_says_what_to_supply() -> None:
+    alone = {"prm.yaml": MEADOW["prm.yaml"]}
+    with pytest.raises(UnreadableFile, match=r"add that map.*resolution, origin and height"):
+        read(alone)
+    told, _ = read(alone, resolution="0.5", origin="-2,10,0", height="6")
+    assert nodes(told) == nodes(read(MEADOW)[0])
+    with pytest.raises(Invalid):
+        read(alone, resolution="0.5", height="0")
+
+
+def test_beside_a_tmap2_in_a_template_the_roadmap_is_set_aside() -> None:
+    tmap2 = (SAMPLE.parent / "tmap2" / "orchard.tmap2.yaml").read_bytes()
+    files = {"config/topological/network.tmap2.yaml": tmap2, "config/topological/prm_autogen.yaml": MEADOW["prm.yaml"]}
+    told = read_bundle(files, Hints(), Known(), Limits())
+    assert not told.files["config/topological/prm_autogen.yaml"].used
+    assert any("richer tmap2" in w.problem for w in told.warnings)
+
+
+@pytest.mark.parametrize(
+    ("text", "where"),
+    [
+        ("nodes: 3\nedges: []", "nodes"),
+        ("nodes:\n- 4\nedges: []", "nodes[0]"),
+        ("nodes:\n- {id: 1, x: 1}\nedges: []", "nodes[0].y"),
+        ("nodes:\n- {id: 1, x: a, y: 1}\nedges: []", "nodes[0].x"),
+        ("nodes:\n- {id: [1], x: 1, y: 1}\nedges: []", "nodes[0].id"),
+        ("nodes:\n- {id: 1, x: 1.0e+300, y: 1}\nedges: []", "nodes[0]"),
+        ("nodes:\n- {id: 1, x: 1, y: 1}\nedges: 3", "edges"),
+        ("nodes:\n- {id: 1, x: 1, y: 1}\nedges:\n- {from: 1}", "edges[0].to"),
+        ("nodes:\n- {id: 1, x: 1, y: 1}\nedges:\n- {from: 1, to: 1, weight: heavy}", "edges[0].weight"),
+        ("nodes:\n- {id: 1, x: 1, y: 1}\nedges: []\npicture: {height: 0}", "picture.origin"),
+        ("nodes:\n- {id: 1, x: 1, y: 1}\nedges: []\npicture: {height: true, origin: [0, 0, 0]}", "picture.height"),
+    ],
+)
+def test_what_is_wrong_is_named(text: str, where: str) -> None:
+    with pytest.raises(BadUpload) as caught:
+        formats.read(Group(FORMAT, "prm.yaml", {**MEADOW, "prm.yaml": text.encode()}), ReadContext())
+    assert [p.where for p in caught.value.problems] == [where]
