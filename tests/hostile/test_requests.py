@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.api.conftest import Api, running, settings_for
-from tests.hostile.corpus import room
+from tests.hostile.corpus import network_cases, room
 
 CELLS = {"op": "cells", "grid": "room", "crs": "local", "value": 100}
 
@@ -77,3 +77,25 @@ def test_an_edit_that_is_nested_deeply(api: Api) -> None:
     found = api.problem("POST", "environments/farm/edits", 422, json={"message": "", "changes": [change]})
     assert "nested" in found["detail"]
     assert api.get("environments/farm").json()["version"] == 1
+
+
+def test_hostile_networks_over_http(api: Api) -> None:
+    """The readers of plain YAML networks, in the server's workers: refused with a place or stored, never an error of
+    ours; what is stored can be had back in its own format."""
+    stored = 0
+    for k, case in enumerate(network_cases()):
+        env = f"hostile-{k}"
+        api.post("environments", {"name": env})
+        known = {"format": case.format} if case.format else {}
+        answer = api.upload(env, case.files, expect=None, **known)
+        assert answer.status_code in (200, 201, 422), f"{case.name}: {answer.status_code} {answer.text[:300]}"
+        if answer.status_code == 422:
+            assert case.verdict != "read", case.name
+            assert all(e["problem"] for e in answer.json()["errors"]), case.name
+            continue
+        assert case.verdict != "refused", case.name
+        stored += 1
+        if case.format and answer.json()["changes"]:
+            back = api.get(f"/maps/{env}/{case.format}", expect=None)
+            assert back.status_code in (200, 404, 422), f"{case.name}: {back.status_code} {back.text[:300]}"
+    assert stored > 20
