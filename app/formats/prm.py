@@ -285,7 +285,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     exact = picture.pixels(xy)
     near = np.round(exact)
     own_nodes = np.array([NAME in n.properties for n in net.nodes], bool)
-    whole = (np.abs(exact - near) <= WHOLE).all(axis=1) if len(exact) else np.empty(0, bool)
+    whole = np.asarray((np.abs(exact - near) <= WHOLE).all(axis=1), bool)
     moved = int((~whole & ~own_nodes).sum())
     context.drop("places of nodes within their pixels", moved, f"pixels of {picture.resolution:g} m are whole numbers")
     # The pixel that holds the place, its left and lower edge included; a roadmap's own broken pixels stay broken.
