@@ -25,6 +25,7 @@ from app import __version__
 from app.api import (
     channels,
     convert,
+    derivations,
     diff,
     environments,
     formats,
@@ -101,7 +102,20 @@ def create_app(settings: Settings) -> Server:
     maps.add_routes(app)
     openapi.add_pages(app)
     api = APIRouter(prefix=API)
-    for module in (environments, versions, layers, maps, diff, channels, transform, formats, convert, jobs, tokens):
+    for module in (
+        environments,
+        versions,
+        layers,
+        maps,
+        diff,
+        channels,
+        transform,
+        formats,
+        derivations,
+        convert,
+        jobs,
+        tokens,
+    ):
         api.include_router(module.router)
     app.include_router(api)
     app.include_router(health.router)

@@ -114,6 +114,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("maps", "Maps in a format, converted on demand."),
             ("channels", "Which version robots drive on."),
             ("transform", "Between earth and local frame."),
+            ("derivations", "What is computed from what, and committing it."),
             ("formats", "What can be read, served and converted."),
             ("jobs", "Work that takes long."),
             ("tokens", "Access."),

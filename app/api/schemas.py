@@ -199,6 +199,25 @@ class EditsBody(In):
     changes: list[Change] = Field(min_length=1, max_length=100_000)
 
 
+class DerivationBody(In):
+    """A layer to be computed from others."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={
+            "examples": [{"method": "objects_to_topology", "parameters": {"join": 0.5}, "replace": True}]
+        },
+    )
+
+    method: str = Field(max_length=200, description="A derivation's name; see `/api/v1/derivations`.")
+    parameters: dict[str, Any] = Field(
+        default_factory=dict, description="Of the method, and of the derivations that have to come before it."
+    )
+    message: str = Field("", max_length=MAX_TEXT)
+    replace: bool = Field(False, description="Whether what a source has told, or people have edited, gives way.")
+
+
 class ChannelBody(In):
     """Where a channel is to stand, and since when."""
 
@@ -305,6 +324,9 @@ class VersionOut(BaseModel):
     sources: list[SourceOut]
     warnings: list[ProblemItem]
     information: dict[str, str]
+    stale: list[dict[str, Any]] = Field(
+        description="Derived parts whose inputs have changed since, with what has: maps are made from them anew."
+    )
 
 
 class LayerOut(BaseModel):
@@ -374,6 +396,18 @@ class FormatOut(BaseModel):
     write: bool
     options: list[dict[str, Any]]
     information: dict[str, str]
+
+
+class DerivationOut(BaseModel):
+    """A way to compute a layer from others."""
+
+    id: str
+    title: str
+    gives: str
+    needs: list[str]
+    cost: float
+    version: int
+    parameters: list[dict[str, Any]]
 
 
 class JobOut(BaseModel):

@@ -88,6 +88,7 @@ def build(*, all_flags: bool = True) -> typer.Typer:
         ("diff", history.diff),
         ("promote", history.promote),
         ("revert", history.revert),
+        ("derive", history.derive),
         ("migrate", serving.migrate),
         ("demo", serving.demo),
     ):

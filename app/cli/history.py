@@ -209,3 +209,48 @@ def _datum(datum: Any) -> str:
         return "none"
     heading = datum.get("heading")
     return f"{datum.get('latitude')}, {datum.get('longitude')}{f', heading {heading:g}°' if heading else ''}"
+
+
+def derive(
+    environment: Annotated[str | None, typer.Argument(help="Name of the environment [default: list methods].")] = None,
+    method: Annotated[str | None, typer.Argument(help="The derivation, such as occupancy_to_topology.")] = None,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--option", "-O", metavar="NAME=VALUE", help="A parameter of the derivation; repeatable."),
+    ] = None,
+    message: options.Message = "",
+    replace: Annotated[bool, typer.Option("--replace", help="Also in place of what a source has told.")] = False,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Compute a layer from others and keep it as a version; without names, list the ways.
+
+    The list needs no server.
+    """
+    if environment is None:
+        from app.api.derivations import as_dict
+        from app.derive import all_derivations
+
+        known = [as_dict(d) for d in all_derivations().values()]
+        if as_json:
+            output.show_json(known)
+            return
+        output.show_table(
+            ("derivation", "what it does", "from", "to", "parameters"),
+            [
+                (d["id"], d["title"], ", ".join(d["needs"]), d["gives"], ", ".join(p["name"] for p in d["parameters"]))
+                for d in known
+            ],
+        )
+        return
+    if method is None:
+        raise typer.BadParameter("name the derivation; `fleetmap derive` lists them")
+    body = {"method": method, "parameters": options.pairs(option), "message": message, "replace": replace}
+    with Client(server, token) as client, output.progress_bar(f"deriving by {method}"):
+        made = client.post(path_of("environments", environment, "derivations"), body, repeat=True)
+    if as_json:
+        output.show_json(made)
+        return
+    output.show(f"{environment}: version {made['version']}: {summary(made.get('changes') or {}) or 'nothing new'}")
+    output.show_warnings(made.get("warnings") or ())

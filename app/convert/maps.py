@@ -111,7 +111,17 @@ class Maps:
         stored = {e.key: e for e in recipe.version.parts}
         dropped = told["dropped"] + making.not_carried(recipe.format, stored, Layers())
         version, credit = recipe.version.number, making.credits_of(lines)
-        return {**told, "version": version, "layers": lines, "attribution": credit, "dropped": dropped}
+        used = {k: why for k, why in recipe.version.stale.items() if k in recipe.chain.keys}
+        stale = [
+            {
+                "problem": f"it was derived from what has changed since ({', '.join(why)}): derive it anew",
+                "where": f"{k.layer} {k.level}/{k.name}",
+            }
+            for k, why in used.items()
+        ]
+        warnings = [*told["warnings"], *stale]
+        more = {"layers": lines, "attribution": credit, "dropped": dropped, "warnings": warnings}
+        return {**told, "version": version, **more}
 
     def coverage(self, version: Version) -> list[dict[str, Any]]:
         """For every format that can be served: direct, derivable or missing, by which chain, and what to supply."""

@@ -39,13 +39,15 @@ class Stock:
     """What there is to make maps from: the parts that have content, and whether there is a datum.
 
     anchors: of each part, which of ``local`` and ``wgs84`` its items are. blank: parts without items; an empty file is
-    a map of its own format, and of no other.
+    a map of its own format, and of no other. pinned: by layer, the derivations and parameters that a version was
+    given its content by; where that content is stale, it is left out of ``keys`` and made anew by them.
     """
 
     keys: frozenset[PartKey]
     datum: bool
     anchors: Mapping[PartKey, frozenset[str]] = field(default_factory=dict)
     blank: frozenset[PartKey] = frozenset()
+    pinned: Mapping[Layer, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
 
     def seen_by(self, known: Format) -> Stock:
         """The same with the blank parts that came from this format."""
@@ -90,9 +92,27 @@ class Recipe:
 def stock(version: Version) -> Stock:
     """What a version holds."""
     entries = [e for e in version.parts if e.count > 0]
+    pinned = _pinned(version, entries)
+    entries = [e for e in entries if e.key.layer not in pinned]
     anchors = {e.key: frozenset(name for name, box in (e.bounds or {}).items() if box) for e in entries}
     blank = frozenset(e.key for e in version.parts if not e.count)
-    return Stock(frozenset(e.key for e in entries), version.datum is not None, anchors, blank)
+    return Stock(frozenset(e.key for e in entries), version.datum is not None, anchors, blank, pinned)
+
+
+def _pinned(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mapping[str, Mapping[str, Any]]]:
+    """The layers all of whose parts were derived and are stale: they are made anew, as they were made before.
+
+    What people have edited, or what lies beside parts that a source has told, stays as it is (the version says that it
+    is stale).
+    """
+    stale = version.stale
+    out: dict[Layer, Mapping[str, Mapping[str, Any]]] = {}
+    for layer in {key.layer for key in stale}:
+        parts = [e for e in entries if e.key.layer == layer]
+        if all(e.key in stale and e.provenance.information == "derived" and not e.provenance.edited for e in parts):
+            steps = [step for e in parts for step in e.provenance.steps]
+            out[layer] = {str(s["step"]): dict(s.get("parameters") or {}) for s in steps if "step" in s}
+    return out
 
 
 def chain(
@@ -112,6 +132,10 @@ def chain(
     """
     asked = dict(values or {})
     available = available.seen_by(known)
+    for layer, before in available.pinned.items():
+        rivals = {n for n, d in derive.all_derivations().items() if d.gives == layer and n not in before}
+        if not without & before.keys():  # else what made it finds nothing any more: any other way will do
+            without |= rivals
     if known.needs.datum and not available.datum:
         raise MissingDatum(f"{known.name} needs {SUPPLY['location']}")
     best = _best(known, available, without, derived=derived)
@@ -128,7 +152,9 @@ def chain(
     needed = {layer for step in best.steps for layer in step.needs}
     keys = sorted({*chosen, *(k for k in keys if k.layer in needed)})
     _check_anchor(known, available, keys)
-    return Chain(derive.with_values(best.steps, asked), tuple(keys))
+    remembered = {name: value for steps in available.pinned.values() for name, value in steps.items()}
+    steps = [derive.with_values([s], {**remembered.get(s.name, {}), **asked})[0] for s in best.steps]
+    return Chain(tuple(steps), tuple(keys))
 
 
 def _best(known: Format, available: Stock, without: frozenset[str], *, derived: bool = True) -> derive.Plan | None:

@@ -3,6 +3,7 @@
 ``prepare`` runs in a worker process (it reads hostile bytes and computes); ``service`` commits what it found.
 """
 
+from app.ingest.derivation import Wish
 from app.ingest.service import Ingest, Outcome, SpooledFile, Upload
 
-__all__ = ["Ingest", "Outcome", "SpooledFile", "Upload"]
+__all__ = ["Ingest", "Outcome", "SpooledFile", "Upload", "Wish"]

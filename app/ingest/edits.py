@@ -207,8 +207,8 @@ class _Session:
         )
 
     def _provenance(self, key: PartKey) -> Provenance:
-        """An edited part stays what it was made of: raw, derived …"""
-        return next((e.provenance for e in self._base.parts if e.key == key), EDITED)
+        """An edited part stays what it was made of: raw, derived …; what was derived is no longer made anew."""
+        return next((e.provenance for e in self._base.parts if e.key == key), EDITED).marked()
 
     def _draft(self, key: PartKey) -> _Draft:
         if key not in self._drafts:

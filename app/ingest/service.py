@@ -14,6 +14,8 @@ from app import formats
 from app.bundle import Hints
 from app.errors import Conflict, Invalid, Problem, StaleParent, UnreadableFile
 from app.formats import Limits
+from app.ingest.derivation import Wish, prepare_derivation
+from app.ingest.derivation import check as check_wish
 from app.ingest.edits import edit_changes
 from app.ingest.prepare import Mode, Proposal, moved, prepare_changes, prepare_upload
 from app.model.frame import GROUND, Datum
@@ -147,6 +149,37 @@ class Ingest:
                     raise
         raise StaleParent(f"{environment} changes faster than this edit can be taken in: try again")
 
+    def derive(
+        self,
+        environment: str,
+        wish: Wish,
+        *,
+        message: str,
+        author: str,
+        if_match: str | None = None,
+        idempotency: str | None = None,
+    ) -> Outcome:
+        """A layer computed from others -> one version.
+
+        Raises NotFound, Invalid, CannotConvert, Conflict (a source has told that layer), StaleParent.
+        """
+        check_wish(wish)
+        key = _idempotency(idempotency, _digest(["derive", wish.method, dict(wish.values), wish.replace, message]))
+        replayed = self._replayed(environment, key)
+        if replayed is not None:
+            return replayed
+        for last in _tries(if_match):
+            base = self._store.version(environment)
+            check_if_match(if_match, base)
+            prepared, warnings = self._in_worker(prepare_derivation, base, wish, what="the layer could not be derived")
+            try:
+                text = message or f"Derived by {wish.method}"
+                return self._commit(environment, base, prepared, author, text, (), warnings, key)
+            except StaleParent:
+                if last:
+                    raise
+        raise StaleParent(f"{environment} changes faster than a layer can be derived: try again")
+
     def revert(
         self,
         environment: str,
@@ -256,11 +289,11 @@ class Ingest:
             for name, size, digest in zip(names, sizes, digests, strict=True)
         ]
 
-    def _in_worker(self, function: Callable[..., Any], *args: Any) -> Any:
+    def _in_worker(self, function: Callable[..., Any], *args: Any, what: str = "the upload could not be read") -> Any:
         try:
             return self._run(function, self._store.database_url, str(self._store.blob_dir), *args)
         except WorkerDied as error:
-            raise UnreadableFile(f"the upload could not be read: {error.detail}") from error
+            raise UnreadableFile(f"{what}: {error.detail}") from error
 
     def _preview(
         self, base: Version, proposal: Proposal, sources: Sequence[Source], author: str, message: str

@@ -110,7 +110,7 @@ def _apply(draft: Draft, entries: dict[PartKey, PartEntry], operation: Operation
         if entry is None or root is None:
             raise NotFound(f"there is no {what}")
         made = parts.edit_features(draft, root, None, set(operation.ids), what)
-        provenance = entry.provenance
+        provenance = entry.provenance.marked()
     else:
         root = root or parts.read_root(draft, parts.empty_features(draft))
         made = parts.edit_features(draft, root, operation.features, (), what)
@@ -129,6 +129,7 @@ def joined(old: Provenance, new: Provenance) -> Provenance:
         upload=None,
         steps=(*old.steps, *(step for step in new.steps if step not in old.steps)),
         attribution=tuple(dict.fromkeys((*old.attribution, *new.attribution))),
+        inputs=old.inputs or new.inputs,
     )
 
 

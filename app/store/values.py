@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any, Literal
 
@@ -14,6 +14,9 @@ from app.errors import Problem
 from app.model.features import Features
 from app.model.frame import Datum, Level
 from app.model.layers import LAYERS, Layer, PartKey
+
+EDIT = "edit"
+"""The step that people's changes leave in the provenance of what was derived."""
 
 Information = Literal["raw", "derived", "template", "generated"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
@@ -84,7 +87,8 @@ class Provenance:
 
     information: it stands in a source, was computed from other layers, filled in, or made up. format: of the source.
     sources: names of the version's sources that gave it. upload: SHA-256 over the uploaded files of this part. steps:
-    how it was computed, with parameters. attribution: licences and credits.
+    how it was computed, with parameters. attribution: licences and credits. inputs: of a derived part, what it was
+    computed from: ``{layer, level, name, hash}``, and ``{datum, levels}`` in a line of their own.
     """
 
     information: Information = "raw"
@@ -93,6 +97,18 @@ class Provenance:
     upload: str | None = None
     steps: tuple[Mapping[str, Any], ...] = ()
     attribution: tuple[str, ...] = ()
+    inputs: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def edited(self) -> bool:
+        """Whether people have changed what was derived."""
+        return any(step.get("step") == EDIT for step in self.steps)
+
+    def marked(self) -> Provenance:
+        """After people's changes: what was derived is no longer made anew."""
+        if not self.inputs or self.edited:
+            return self
+        return replace(self, steps=(*self.steps, {"step": EDIT}))
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-like members, without the empty ones."""
@@ -103,6 +119,7 @@ class Provenance:
             "upload": self.upload,
             "steps": [dict(step) for step in self.steps],
             "attribution": list(self.attribution),
+            "inputs": [dict(line) for line in self.inputs],
         }
         return {name: value for name, value in members.items() if value}
 
@@ -116,6 +133,7 @@ class Provenance:
             upload=members.get("upload"),
             steps=tuple(members.get("steps", ())),
             attribution=tuple(members.get("attribution", ())),
+            inputs=tuple(members.get("inputs", ())),
         )
 
 
@@ -163,6 +181,28 @@ class Version:
         return next((entry for entry in self.parts if entry.key == key), None)
 
     @property
+    def stale(self) -> dict[PartKey, tuple[str, ...]]:
+        """Derived parts whose inputs are no longer what they were computed from, each with what has changed."""
+        now = {(e.key.layer, e.key.level, e.key.name): e.hash for e in self.parts if e.count}
+        out: dict[PartKey, tuple[str, ...]] = {}
+        for entry in self.parts:
+            changed = []
+            for line in entry.provenance.inputs:
+                if "layer" not in line:
+                    if line != frame_line(self.datum, self.levels):
+                        changed.append("datum or levels")
+                elif now.get((line["layer"], line["level"], line["name"])) != line["hash"]:
+                    changed.append(f"{line['layer']} {line['level']}/{line['name']}")
+            used = {(n["layer"], n["level"], n["name"]) for n in entry.provenance.inputs if "layer" in n}
+            layers = {layer for layer, _, _ in used}
+            own = (entry.key.layer, entry.key.level, entry.key.name)
+            new = [k for k in now if k[0] in layers and k not in used and k != own] if used else []
+            changed += [f"{layer} {level}/{name}" for layer, level, name in new]
+            if changed:
+                out[entry.key] = tuple(changed)
+        return out
+
+    @property
     def information(self) -> dict[str, str]:
         """For each of the seven layers raw, derived, template, generated, or missing; raw beats the others."""
         order = ("raw", "derived", "generated", "template")
@@ -188,7 +228,19 @@ class Version:
             "sources": [source.as_dict() for source in self.sources],
             "warnings": [warning.as_dict() for warning in self.warnings],
             "information": self.information,
+            "stale": [
+                {"layer": k.layer, "level": k.level, "name": k.name, "changed": list(changed)}
+                for k, changed in self.stale.items()
+            ],
         }
+
+
+def frame_line(datum: Datum | None, levels: Sequence[Level]) -> dict[str, Any]:
+    """Datum and levels as a line among a derivation's inputs."""
+    return {
+        "datum": datum.as_dict() if datum else None,
+        "levels": [[level.name, level.elevation] for level in levels],
+    }
 
 
 @dataclass(frozen=True, slots=True)

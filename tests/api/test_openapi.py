@@ -48,6 +48,7 @@ def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
         f"{v}/maps/{{format}}": "get", f"{v}/maps/{{format}}/{{file}}": "get", f"{v}/reports/{{format}}": "get",
         f"{e}/diff": "get", f"{e}/channels": "get", f"{e}/channels/{{channel}}": "put",
         f"{e}/channels/{{channel}}/planned": "delete", f"{e}/transform": "get", "/api/v1/convert": "post",
+        "/api/v1/derivations": "get", f"{e}/derivations": "post",
         "/api/v1/jobs/{id}": "get delete", "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete",
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
     }  # fmt: skip
@@ -128,6 +129,10 @@ def example_of(parameter: dict[str, Any]) -> Any:
     return None
 
 
+LANE = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {},
+"geometry": {"type": "LineString", "coordinates": [[-0.524, 53.269], [-0.523, 53.269]]}}]}"""
+
+
 def bodies_of(schema: dict[str, Any], op: dict[str, Any]) -> list[dict[str, Any]]:
     """Ways to send the examples of a call, as arguments for the client."""
     content = op.get("requestBody", {}).get("content", {})
@@ -159,6 +164,8 @@ def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -
         if path == "/api/v1/environments/{env}/channels/{channel}/planned":
             body = {"version": 1, "activate_at": "2099-01-01T00:00:00Z"}
             api("PUT", "environments/farm/channels/production", 200, json=body)
+        if path == "/api/v1/environments/{env}/derivations":
+            api.upload("farm", {"lane.geojson": LANE})
         if _name((path, method, op)) == "purge_environment":
             api("DELETE", "environments/farm", 204)
         query: dict[str, Any] = {}

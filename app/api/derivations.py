@@ -1,0 +1,72 @@
+"""Layers computed from others: which ways there are, and committing what one of them gives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter
+from starlette.responses import Response
+
+from app import derive, parameters
+from app.api.access import Editor, Viewer
+from app.api.answers import Route, answer
+from app.api.schemas import DerivationBody, DerivationOut, EnvironmentPath, IdempotencyKey, IfMatch, VersionOut, told
+from app.api.services import Here
+from app.api.versions import told_as
+from app.derive import Derivation
+from app.errors import Invalid, NotFound, Problem
+from app.ingest import Wish
+
+router = APIRouter(tags=["derivations"], route_class=Route)
+
+
+def as_dict(known: Derivation) -> dict[str, Any]:
+    """The derivation as clients see it."""
+    return {
+        "id": known.name,
+        "title": known.title,
+        "gives": known.gives,
+        "needs": sorted(known.needs),
+        "cost": known.cost,
+        "version": known.version,
+        "parameters": parameters.describe(known.parameters),
+    }
+
+
+@router.get("/derivations", responses=told(list[DerivationOut]), summary="All derivations")
+def list_derivations(_: Viewer) -> Response:
+    """What can be computed from what. Maps use them by themselves; their parameters go into a map's query."""
+    return answer([as_dict(known) for known in derive.all_derivations().values()])
+
+
+@router.post(
+    "/environments/{env}/derivations",
+    status_code=201,
+    responses={
+        **told(VersionOut, 400, 404, 409, 412, 415, 503, ok=201, description="A new version"),
+        200: {"model": VersionOut, "description": "Nothing changed: the head."},
+    },
+    summary="Compute a layer and commit it",
+)
+def create_derivation(
+    env: EnvironmentPath,
+    body: DerivationBody,
+    here: Here,
+    who: Editor,
+    if_match: IfMatch = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """A version whose provenance says how the layer was made and from what. It goes stale when that changes.
+
+    409 where a source has told that layer, unless `replace` is true.
+    """
+    wish = Wish(body.method, body.parameters, body.replace)
+    try:
+        outcome = here.ingest.derive(
+            env, wish, message=body.message, author=who.name, if_match=if_match, idempotency=idempotency_key
+        )
+    except NotFound as error:
+        if body.method in derive.all_derivations():
+            raise
+        raise Invalid(error.detail, [Problem("no such derivation", where="body.method")]) from None
+    return told_as(outcome)
