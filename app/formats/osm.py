@@ -41,8 +41,9 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext, register
+from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext, _osm_text, register
 from app.formats._osm import INT64, Attributes, Data, Tags, Way, is_pbf, parse, unpack
+from app.formats._osm_text import NOTHING, Node, as_texts, attribute_text, element_id, integers, plain
 from app.formats._text import DEGREES, numbers
 from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, points, segments
 from app.model.frame import GROUND
@@ -463,16 +464,6 @@ MOST_NODES = 2000
 """Nodes a way may have (OSM API 0.6)."""
 
 NOWHERE = (float("nan"), float("nan"))
-NOTHING: Mapping[str, str] = {}
-
-
-@dataclass(slots=True)
-class _Node:
-    lon: float
-    lat: float
-    tags: Mapping[str, str] = field(default_factory=dict)
-    attributes: Mapping[str, str] = field(default_factory=dict)
-    vertex: bool = False
 
 
 @dataclass(slots=True)
@@ -507,13 +498,13 @@ class _Writer:
     def __init__(self, layers: Layers, context: WriteContext) -> None:
         self.layers = layers
         self.context = context
-        self.nodes: dict[int, _Node] = {}
+        self.nodes: dict[int, Node] = {}
         self.ways: dict[int, tuple[list[int], Mapping[str, str], Mapping[str, str]]] = {}
         self.relations: dict[int, tuple[list[tuple[str, int, str]], Mapping[str, str], Mapping[str, str]]] = {}
         rows = (p for part in layers.vector("objects").values() for p in part.properties)
         own = [p for p in rows if isinstance(p.get("osm"), Mapping)]
-        refs = [refs for p in own if (refs := _integers(p["osm"].get("refs")))]
-        known = [_number(i) for part in layers.parts.values() if isinstance(part, Features) for i in part.ids]
+        refs = [refs for p in own if (refs := integers(p["osm"].get("refs")))]
+        known = [element_id(i) for part in layers.parts.values() if isinstance(part, Features) for i in part.ids]
         lowest = min(chain([0], (min(r) for r in refs), (k[1] for k in known if k)))
         self.next = {"node": lowest - 1, "way": lowest - 1, "relation": lowest - 1}
         self.referenced = set(chain.from_iterable(refs))
@@ -543,7 +534,7 @@ class _Writer:
                 for i, geometry, properties in zip(
                     part.ids, part.in_wgs84(self.layers.frame), part.properties, strict=True
                 ):
-                    number, said = _number(i), properties.get("osm")
+                    number, said = element_id(i), properties.get("osm")
                     if layer == "objects" and key.name == FAMILY and number and isinstance(said, Mapping):
                         mine.append((number[0], number[1], geometry, said, properties))
                     elif i in drawn and shapely.get_type_id(geometry) in (0, 1, 2, 5):
@@ -581,7 +572,7 @@ class _Writer:
         for k, x, y, geometry in zip(chosen.tolist(), lon, lat, at, strict=True):
             i, properties = part.ids[k], part.properties[k]
             said = properties.get("osm")
-            number = _number(i)
+            number = element_id(i)
             own = (
                 number is not None and number[0] == "n" and (isinstance(said, Mapping) or number[1] in self.referenced)
             )
@@ -589,14 +580,14 @@ class _Writer:
             if new in self.nodes and (self.nodes[new].lon, self.nodes[new].lat) != (x, y):
                 new = self.fresh("node")
             if isinstance(said, Mapping):
-                tags, attributes = _texts(said.get("tags")), _texts(said.get("attributes"))
+                tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
             else:
                 # A street node that went through another format is called by its id there: that is no name.
                 nameless = own and properties.get("name", i) == i
                 tags, attributes = NOTHING if nameless else self.tags(i, properties, ("name",)), NOTHING
             if geometry.has_z and geometry.geom_type == "Point" and not geometry.is_empty and "ele" not in tags:
                 tags = {**tags, "ele": repr(float(geometry.z))}
-            self.nodes[new] = _Node(x, y, tags, attributes)
+            self.nodes[new] = Node(x, y, tags, attributes)
             level.nodes[i] = new
             if own and number is not None:
                 level.moved[number[1]] = new
@@ -617,21 +608,21 @@ class _Writer:
         new = number
         if number in self.nodes and (self.nodes[number].lon, self.nodes[number].lat) != (x, y):
             new = self.fresh("node")
-        self.nodes[new] = _Node(x, y, _texts(said.get("tags")), _texts(said.get("attributes")))
+        self.nodes[new] = Node(x, y, as_texts(said.get("tags")), as_texts(said.get("attributes")))
         level.moved[number] = new
         if said.get("children"):
             self.lose("elements that OSM does not know", len(said["children"]))
 
     def way(self, level: _Level, number: int, geometry: Any, said: Mapping[str, Any]) -> bool:
         """Write an OSM way; False where its properties or its geometry are no longer those of one."""
-        refs = _integers(said.get("refs"))
+        refs = integers(said.get("refs"))
         at = _course(geometry)
         if refs is None or at is None:
             return False
-        tags, attributes = _texts(said.get("tags")), _texts(said.get("attributes"))
+        tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
         if said.get("children"):
             self.lose("elements that OSM does not know", len(said["children"]))
-        missing = set(_integers(said.get("missing")) or ())
+        missing = set(integers(said.get("missing")) or ())
         first = self.fresh("way") if number in self.ways else number
         if level.has_network and "highway" in tags and not deleted(attributes):
             runs = self.runs(level, number, refs, tags, {refs[k] for k in missing if 0 <= k < len(refs)})
@@ -677,7 +668,7 @@ class _Writer:
             said = tags
             if k in there:
                 ways, other = there[k]
-                said = _texts(other) if other is not None else tags
+                said = as_texts(other) if other is not None else tags
                 if len(ways) < wanted[k]:
                     said = {**said, "oneway": "yes" if "forward" in ways else "-1"}
             elif state is not None:
@@ -716,11 +707,11 @@ class _Writer:
             known = self.nodes.get(new)
             if place is not None:
                 if known is None:
-                    self.nodes[new] = _Node(place[0], place[1], NOTHING, _texts(attributes[k]), vertex=True)
+                    self.nodes[new] = Node(place[0], place[1], NOTHING, as_texts(attributes[k]), vertex=True)
                 elif known.vertex and (known.lon != place[0] or known.lat != place[1]):
                     # Two ways no longer agree where their common node is: each keeps its course.
                     new = self.fresh("node")
-                    self.nodes[new] = _Node(place[0], place[1], vertex=True)
+                    self.nodes[new] = Node(place[0], place[1], vertex=True)
             out.append(new)
         return out
 
@@ -735,7 +726,7 @@ class _Writer:
         for x, y in at.tolist():
             if (x, y) not in known:
                 known[x, y] = new = self.fresh("node")
-                self.nodes[new] = _Node(x, y, vertex=True)
+                self.nodes[new] = Node(x, y, vertex=True)
             out.append(known[x, y])
         return out
 
@@ -759,7 +750,7 @@ class _Writer:
                 members.append((kind, i, role))
         if said.get("children"):
             self.lose("elements that OSM does not know", len(said["children"]))
-        tags, attributes = _texts(said.get("tags")), _texts(said.get("attributes"))
+        tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
         self.relations[level.relations[number]] = (members, tags, attributes)
 
     def new_ways(self, part: Features, level: _Level) -> None:
@@ -817,13 +808,13 @@ class _Writer:
         out = []
         for x, y in shapely.get_coordinates(geometry)[1:-1].tolist():
             out.append(self.fresh("node"))
-            self.nodes[out[-1]] = _Node(x, y, vertex=True)
+            self.nodes[out[-1]] = Node(x, y, vertex=True)
         return out
 
     def edge_tags(self, i: str, p: Properties, level: _Level) -> dict[str, str]:
         said = p.get("osm")
         if isinstance(said, Mapping) and isinstance(said.get("tags"), Mapping):
-            return {k: v for k, v in _texts(said["tags"]).items() if k != "oneway"}
+            return {k: v for k, v in as_texts(said["tags"]).items() if k != "oneway"}
         tags = {"highway": "path"}
         for word, key in (("name", "name"), ("action", "action"), ("width", "width")):
             value = p.get(word)
@@ -861,7 +852,7 @@ class _Writer:
         tags = self.tags(i, properties, level=level.name)
         said = properties.get("osm")
         if isinstance(said, Mapping):
-            tags = {**_texts(said.get("tags")), **tags}
+            tags = {**as_texts(said.get("tags")), **tags}
         if zone:
             tags["zone"] = str(properties.get("kind") or "yes")
         parts = _simple(geometry)
@@ -873,7 +864,7 @@ class _Writer:
         for part in parts:
             if part.geom_type == "Point":
                 x, y = part.x, part.y
-                self.nodes[self.fresh("node")] = _Node(x, y, tags)
+                self.nodes[self.fresh("node")] = Node(x, y, tags)
             elif part.geom_type == "Polygon" and not single:
                 rings.append((self.line(part.exterior, NOTHING), "outer"))
                 rings += [(self.line(r, NOTHING), "inner") for r in part.interiors]
@@ -891,12 +882,12 @@ class _Writer:
         nodes = []
         for x, y in at[:-1]:
             nodes.append(self.fresh("node"))
-            self.nodes[nodes[-1]] = _Node(x, y, vertex=True)
+            self.nodes[nodes[-1]] = Node(x, y, vertex=True)
         if at[0] == at[-1] and len(at) > 2:
             nodes.append(nodes[0])
         else:
             nodes.append(self.fresh("node"))
-            self.nodes[nodes[-1]] = _Node(at[-1][0], at[-1][1], vertex=True)
+            self.nodes[nodes[-1]] = Node(at[-1][0], at[-1][1], vertex=True)
         first = self.fresh("way")
         self.ways[first] = (nodes[:MOST_NODES], tags, NOTHING)
         for begin in range(MOST_NODES - 1, len(nodes) - 1, MOST_NODES - 1):
@@ -908,68 +899,20 @@ class _Writer:
     def text(self) -> str:
         for what, times in sorted(self.lost.items()):
             self.context.drop(what, times, "OSM has no place for them")
-        cache: dict[int, str] = {}
-
-        def attributes(said: Mapping[str, str]) -> str:
-            if not said:
-                return ""
-            known = cache.get(id(said))
-            if known is None:
-                # Keyed by identity: thousands of elements of one changeset share one mapping, which lives here.
-                known = cache[id(said)] = _attribute_text(said, _RESERVED)
-            return known
-
-        lines = ['<?xml version="1.0" encoding="UTF-8"?>', *self.head()]
-        order = sorted(self.nodes, key=_order)
-        lon = _degrees([self.nodes[i].lon for i in order])
-        lat = _degrees([self.nodes[i].lat for i in order])
-        for i, x, y in zip(order, lon, lat, strict=True):
-            node = self.nodes[i]
-            place = f' lat="{y}" lon="{x}"' if x is not None else ""
-            if node.tags:
-                lines.append(f' <node id="{i}"{attributes(node.attributes)}{place}>')
-                lines += _tag_lines(node.tags)
-                lines.append(" </node>")
-            else:
-                lines.append(f' <node id="{i}"{attributes(node.attributes)}{place}/>')
-        for i in sorted(self.ways, key=_order):
-            refs, tags, said = self.ways[i]
-            if not refs and not tags:
-                lines.append(f' <way id="{i}"{attributes(said)}/>')
-                continue
-            lines.append(f' <way id="{i}"{attributes(said)}>')
-            lines += [f'  <nd ref="{r}"/>' for r in refs]
-            lines += _tag_lines(tags)
-            lines.append(" </way>")
-        for i in sorted(self.relations, key=_order):
-            members, tags, said = self.relations[i]
-            if not members and not tags:
-                lines.append(f' <relation id="{i}"{attributes(said)}/>')
-                continue
-            lines.append(f' <relation id="{i}"{attributes(said)}>')
-            lines += [f'  <member type="{_escape(t)}" ref="{r}" role="{_escape(role)}"/>' for t, r, role in members]
-            lines += _tag_lines(tags)
-            lines.append(" </relation>")
-        lines.append("</osm>\n")
-        return "\n".join(lines)
+        return _osm_text.document(self.head(), self.nodes, self.ways, self.relations)
 
     def head(self) -> list[str]:
         documents = [p.document for p in self.layers.parts.values() if isinstance(p, Features)]
         said = [d["osm"] for d in documents if isinstance(d.get("osm"), Mapping)]
         root: dict[str, str] = {"version": "0.6", "generator": GENERATOR}
         for one in said:
-            root |= _texts(one.get("attributes"))
+            root |= as_texts(one.get("attributes"))
         root["version"] = "0.6"
         if self.context.attribution and not root.keys() & {"attribution", "copyright", "license"}:
             root["attribution"] = "; ".join(self.context.attribution)
-        lines = [f"<osm{_attribute_text(root, frozenset())}>"]
+        lines = [f"<osm{attribute_text(root, frozenset())}>"]
         for one in said:
-            rows = one.get("elements")
-            for row in rows if isinstance(rows, list) else []:
-                name, attributes, text = row if isinstance(row, list) and len(row) == 3 else ("", None, "")
-                if _NAME.fullmatch(str(name)):
-                    inner = _escape(str(text))
-                    lines.append(f" <{name}{_attribute_text(_texts(attributes), frozenset())}>{inner}</{name}>")
+            lines += _osm_text.further_elements(one.get("elements"))
         boxes = [d["bounds"] for d in documents if _is_box(d.get("bounds"))]
         if not boxes:
             boxes = self.fence()
@@ -977,11 +920,11 @@ class _Writer:
             west, south, east, north = zip(*boxes, strict=True)
             texts = numbers(np.array([min(south), min(west), max(north), max(east)], np.float64), DEGREES)
             names = ("minlat", "minlon", "maxlat", "maxlon")
-            box = {k: _plain(v) for k, v in zip(names, texts, strict=True)}
-            kept = [_texts(b) for one in said for b in one.get("bounds") or []]
+            box = {k: plain(v) for k, v in zip(names, texts, strict=True)}
+            kept = [as_texts(b) for one in said for b in one.get("bounds") or []]
             if len(kept) == 1 and all(k in box or k not in names for k in kept[0]):
                 box = {**{k: v for k, v in kept[0].items() if k != "box"}, **box}
-            lines.append(f" <bounds{_attribute_text(box, frozenset())}/>")
+            lines.append(f" <bounds{attribute_text(box, frozenset())}/>")
         return lines
 
     def fence(self) -> list[list[float]]:
@@ -992,50 +935,6 @@ class _Writer:
                 boxes = shapely.bounds(part.in_wgs84(self.layers.frame))
                 out += boxes[~np.isnan(boxes).any(axis=1)].tolist()
         return out
-
-
-_ID = re.compile(r"([nwr])(-?\d{1,19})", re.ASCII)
-_NAME = re.compile(r"[A-Za-z_][\w.:-]*", re.ASCII)
-_RESERVED = frozenset({"id", "lat", "lon"})
-_SPECIAL = re.compile('[&<>"\\x00-\\x1f\\ud800-\\udfff\\ufffe\\uffff]')
-_ESCAPES = {"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"}
-
-
-def _escape(text: str) -> str:
-    """Text as it may stand in an attribute; what XML cannot say at all becomes the replacement character."""
-    return _SPECIAL.sub(lambda m: _ESCAPES.get(m[0], "\ufffd"), text) if _SPECIAL.search(text) else text
-
-
-def _number(i: str) -> tuple[str, int] | None:
-    match = _ID.fullmatch(i)
-    if match is None or abs(int(match[2])) >= INT64 or str(int(match[2])) != match[2]:
-        return None
-    return match[1], int(match[2])
-
-
-def _order(i: int) -> tuple[bool, int]:
-    """The order of the OSM tools: negative ids first, by magnitude."""
-    return i > 0, abs(i)
-
-
-def _integers(value: Any) -> list[int] | None:
-    """A list of 64 bit integers, or None where it is not one (properties can be edited by anybody)."""
-    if not isinstance(value, list | tuple):
-        return None
-    return list(value) if all(type(v) is int and abs(v) < INT64 for v in value) else None
-
-
-def _texts(value: Any) -> Mapping[str, str]:
-    """A mapping of texts to texts, whatever was stored."""
-    if not isinstance(value, Mapping):
-        return NOTHING
-    try:
-        "".join(value.values())
-    except TypeError:
-        pass
-    else:
-        return value
-    return {k: v if isinstance(v, str) else str(v) for k, v in value.items() if v is not None}
 
 
 def _course(geometry: Any) -> NDArray[np.float64] | None:
@@ -1058,23 +957,6 @@ def _simple(geometry: Any) -> list[Any]:
         else:
             out.append(one)
     return out
-
-
-def _degrees(values: list[float]) -> list[str | None]:
-    return [None if v == "nan" else _plain(v) for v in numbers(values, DEGREES)]
-
-
-def _plain(text: str) -> str:
-    """Never an exponent: not all readers of OSM know one."""
-    return f"{float(text):.12f}".rstrip("0") if "e" in text else text
-
-
-def _attribute_text(said: Mapping[str, str], without: frozenset[str]) -> str:
-    return "".join(f' {k}="{_escape(v)}"' for k, v in said.items() if k not in without and _NAME.fullmatch(k))
-
-
-def _tag_lines(tags: Mapping[str, str]) -> list[str]:
-    return [f'  <tag k="{_escape(k)}" v="{_escape(v)}"/>' for k, v in tags.items()]
 
 
 def _is_box(value: Any) -> bool:

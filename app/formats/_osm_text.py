@@ -1,0 +1,160 @@
+"""OpenStreetMap XML as text: nodes, ways and relations as the OSM tools write them, for all formats on top of OSM.
+
+Values come from stored properties, which anybody can edit: what is not of the right type is turned into text or told
+to be none, and what XML cannot say becomes the replacement character.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from app.formats._osm import INT64
+from app.formats._text import DEGREES, numbers
+
+NOTHING: Mapping[str, str] = {}
+
+Way = tuple[Sequence[int], Mapping[str, str], Mapping[str, str]]
+"""The ids of its nodes, tags, attributes."""
+
+Relation = tuple[Sequence[tuple[str, int, str]], Mapping[str, str], Mapping[str, str]]
+"""Members as (type, id, role), tags, attributes."""
+
+
+@dataclass(slots=True)
+class Node:
+    """A node in degrees, NaN where it has no place. vertex: it is there only as a bend of a way."""
+
+    lon: float
+    lat: float
+    tags: Mapping[str, str] = field(default_factory=dict)
+    attributes: Mapping[str, str] = field(default_factory=dict)
+    vertex: bool = False
+
+
+def document(
+    head: Iterable[str], nodes: Mapping[int, Node], ways: Mapping[int, Way], relations: Mapping[int, Relation]
+) -> str:
+    """The file: the lines of ``head`` (the root element first), then nodes, ways and relations, each by id."""
+    cache: dict[int, str] = {}
+
+    def attributes(said: Mapping[str, str]) -> str:
+        if not said:
+            return ""
+        known = cache.get(id(said))
+        if known is None:
+            # Keyed by identity: thousands of elements of one changeset share one mapping, which lives here.
+            known = cache[id(said)] = attribute_text(said, RESERVED)
+        return known
+
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', *head]
+    order = sorted(nodes, key=rank)
+    lon = degrees([nodes[i].lon for i in order])
+    lat = degrees([nodes[i].lat for i in order])
+    for i, x, y in zip(order, lon, lat, strict=True):
+        node = nodes[i]
+        place = f' lat="{y}" lon="{x}"' if x is not None else ""
+        if node.tags:
+            lines.append(f' <node id="{i}"{attributes(node.attributes)}{place}>')
+            lines += tag_lines(node.tags)
+            lines.append(" </node>")
+        else:
+            lines.append(f' <node id="{i}"{attributes(node.attributes)}{place}/>')
+    for i in sorted(ways, key=rank):
+        refs, tags, said = ways[i]
+        if not refs and not tags:
+            lines.append(f' <way id="{i}"{attributes(said)}/>')
+            continue
+        lines.append(f' <way id="{i}"{attributes(said)}>')
+        lines += [f'  <nd ref="{r}"/>' for r in refs]
+        lines += tag_lines(tags)
+        lines.append(" </way>")
+    for i in sorted(relations, key=rank):
+        members, tags, said = relations[i]
+        if not members and not tags:
+            lines.append(f' <relation id="{i}"{attributes(said)}/>')
+            continue
+        lines.append(f' <relation id="{i}"{attributes(said)}>')
+        lines += [f'  <member type="{escape(t)}" ref="{r}" role="{escape(role)}"/>' for t, r, role in members]
+        lines += tag_lines(tags)
+        lines.append(" </relation>")
+    lines.append("</osm>\n")
+    return "\n".join(lines)
+
+
+def further_elements(rows: Any) -> list[str]:
+    """Lines for what stands beside the data (``note``, ``meta``, ``MetaInfo``): rows of [name, attributes, text]."""
+    lines = []
+    for row in rows if isinstance(rows, list) else []:
+        name, said, text = row if isinstance(row, list) and len(row) == 3 else ("", None, "")
+        if _NAME.fullmatch(str(name)):
+            inner = escape(str(text))
+            lines.append(f" <{name}{attribute_text(as_texts(said), frozenset())}>{inner}</{name}>")
+    return lines
+
+
+_ID = re.compile(r"([nwr])(-?\d{1,19})", re.ASCII)
+_NAME = re.compile(r"[A-Za-z_][\w.:-]*", re.ASCII)
+RESERVED = frozenset({"id", "lat", "lon"})
+_SPECIAL = re.compile('[&<>"\\x00-\\x1f\\ud800-\\udfff\\ufffe\\uffff]')
+_ESCAPES = {"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"}
+
+
+def escape(text: str) -> str:
+    """Text as it may stand in an attribute; what XML cannot say at all becomes the replacement character."""
+    return _SPECIAL.sub(lambda m: _ESCAPES.get(m[0], "\ufffd"), text) if _SPECIAL.search(text) else text
+
+
+def element_id(i: str) -> tuple[str, int] | None:
+    """``n12`` as ("n", 12), ``w…`` and ``r…`` alike; None for any other text."""
+    match = _ID.fullmatch(i)
+    if match is None or abs(int(match[2])) >= INT64 or str(int(match[2])) != match[2]:
+        return None
+    return match[1], int(match[2])
+
+
+def rank(i: int) -> tuple[bool, int]:
+    """The order of the OSM tools: negative ids first, by magnitude."""
+    return i > 0, abs(i)
+
+
+def integers(value: Any) -> list[int] | None:
+    """A list of 64 bit integers, or None where it is not one (properties can be edited by anybody)."""
+    if not isinstance(value, list | tuple):
+        return None
+    return list(value) if all(type(v) is int and abs(v) < INT64 for v in value) else None
+
+
+def as_texts(value: Any) -> Mapping[str, str]:
+    """A mapping of texts to texts, whatever was stored."""
+    if not isinstance(value, Mapping):
+        return NOTHING
+    try:
+        "".join(value.values())
+    except TypeError:
+        pass
+    else:
+        return value
+    return {k: v if isinstance(v, str) else str(v) for k, v in value.items() if v is not None}
+
+
+def degrees(values: list[float]) -> list[str | None]:
+    """Degrees as text, None for NaN."""
+    return [None if v == "nan" else plain(v) for v in numbers(values, DEGREES)]
+
+
+def plain(text: str) -> str:
+    """Never an exponent: not all readers of OSM know one."""
+    return f"{float(text):.12f}".rstrip("0") if "e" in text else text
+
+
+def attribute_text(said: Mapping[str, str], without: frozenset[str]) -> str:
+    """XML attributes, each with a space before it; those that XML could not name are left out."""
+    return "".join(f' {k}="{escape(v)}"' for k, v in said.items() if k not in without and _NAME.fullmatch(k))
+
+
+def tag_lines(tags: Mapping[str, str]) -> list[str]:
+    """A ``<tag>`` for each."""
+    return [f'  <tag k="{escape(k)}" v="{escape(v)}"/>' for k, v in tags.items()]
