@@ -151,19 +151,25 @@ def chain(
         chosen = known.choose(chosen, options)
     needed = {layer for step in best.steps for layer in step.needs}
     keys = sorted({*chosen, *(k for k in keys if k.layer in needed)})
-    _check_anchor(known, available, keys)
+    if not _is_whole(known, available):
+        _check_anchor(known, available, keys)
     remembered = {name: value for steps in available.pinned.values() for name, value in steps.items()}
     steps = [derive.with_values([s], {**remembered.get(s.name, {}), **asked})[0] for s in best.steps]
     return Chain(tuple(steps), tuple(keys))
 
 
 def _best(known: Format, available: Stock, without: frozenset[str], *, derived: bool = True) -> derive.Plan | None:
-    best: derive.Plan | None = None
+    best: derive.Plan | None = derive.Plan((), 0.0) if _is_whole(known, available) else None
     for wanted in known.needs.one_of:
         found = derive.plan(available.layers, wanted, without)
         if found is not None and (derived or not found.steps) and (best is None or found.cost < best.cost):
             best = found
     return best
+
+
+def _is_whole(known: Format, available: Stock) -> bool:
+    """Whether a map of this very format is stored, so that nothing else is needed."""
+    return known.needs.own and any(k.layer == "objects" and k.name == known.family for k in available.keys)
 
 
 def _taken(way: derive.Plan) -> frozenset[str]:

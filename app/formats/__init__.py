@@ -120,13 +120,15 @@ class Needs:
 
     one_of: alternatives, the first that is complete is enough; every carried layer that is there is written.
     anchor: the coordinates the format speaks, so that items anchored otherwise need a datum. datum: needed always.
-    also: layers of which the writer uses a part where they are there, and does without where they are not.
+    also: layers of which the writer uses a part where they are there, and does without where they are not. own: objects
+    of the format's own family are a whole map: with them nothing else is needed, no datum either.
     """
 
     one_of: tuple[frozenset[Layer], ...]
     anchor: Anchor | None = None
     datum: bool = False
     also: frozenset[Layer] = frozenset()
+    own: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -370,6 +370,70 @@ def xml_cases() -> Iterator[Case]:
     yield Case("osm/many empty bzip2 streams", {"a.osm.bz2": bz2.compress(b"") * 20_000}, "refused", "osm")
 
 
+def lanelet_cases() -> Iterator[Case]:
+    """Lanelets that lead astray: their points, their bounds, what they say of themselves, the file beside them."""
+    node = (
+        "<node id='%d' lat='%s' lon='%s'><tag k='local_x' v='%s'/><tag k='local_y' v='%s'/><tag k='ele' v='%s'/></node>"
+    )
+    way = "<way id='%d'><nd ref='%d'/><nd ref='%d'/></way>"
+    lane = "<relation id='%d'><member type='way' ref='%s' role='left'/><member type='way' ref='%s' role='right'/>%s<tag k='type' v='lanelet'/></relation>"
+
+    def place(
+        at: tuple[str, str] = ("0.0001", "0.0001"),
+        metres: tuple[str, str, str] = ("1", "2", "3"),
+        inside: str = "",
+        more: str = "",
+        left: str = "5",
+        right: str = "6",
+    ) -> bytes:
+        nodes = [
+            (1, *at, *metres),
+            (2, "0.0001", "0.0002", "9", "2", "3"),
+            (3, "0", "0.0001", "1", "0", "3"),
+            (4, "0", "0.0002", "9", "0", "3"),
+        ]
+        body = (
+            "".join(node % row for row in nodes) + way % (5, 1, 2) + way % (6, 3, 4) + lane % (7, left, right, inside)
+        )
+        return f"<osm version='0.6'>{body}{more}</osm>".encode()
+
+    yield Case("lanelet/far point", {"a.osm": place(("0.0001", "179"))}, "refused")
+    for value in ("nan", "inf", "1e999", "-1e300", "9" * 5000, "", "1;2"):
+        yield Case(f"lanelet/elevation {value[:10]}", {"a.osm": place(metres=("1", "2", value))}, "read")
+        beside = {"a.osm": place(metres=(value, "2", "3")), "map_projector_info.yaml": b"projector_type: Local"}
+        yield Case(f"lanelet/metres {value[:10]}", beside, "read")
+        tag = f"<tag k='speed_limit' v='{value}'/><tag k='width' v='{value}'/><tag k='one_way' v='{value}'/>"
+        yield Case(f"lanelet/words {value[:10]}", {"a.osm": place(inside=tag)}, "read")
+    for name, left, right in (
+        ("itself", "7", "7"),
+        ("one bound twice", "5", "5"),
+        ("nothing", "8", "9"),
+        ("points", "1", "2"),
+    ):
+        yield Case(f"lanelet/bounds are {name}", {"a.osm": place(left=left, right=right)}, "read")
+    points = "<way id='5'><nd ref='1'/><nd ref='1'/></way><way id='6'><nd ref='1'/><nd ref='1'/></way>"
+    yield Case("lanelet/without length", {"a.osm": place(more=points)}, "read")
+    ring = "".join(
+        lane % (10 + k, "5", "6", f"<member type='relation' ref='{10 + (k + 1) % 3}' role='regulatory_element'/>")
+        for k in range(3)
+    )
+    yield Case("lanelet/relations in a ring", {"a.osm": place(more=ring)}, "read")
+    many = "".join(lane % (10 + k, "5", "6", "") for k in range(3000))
+    yield Case("lanelet/many on the same bounds", {"a.osm": place(more=many)}, "read")
+    same = "<tag k='fleetmap:edge' v='x'/><tag k='fleetmap:source' v='n1:3'/><tag k='fleetmap:target' v='y'/>"
+    alike = lane % (10, "5", "6", same) + lane % (11, "6", "5", same)
+    yield Case("lanelet/our own words twice", {"a.osm": place(more=alike)}, "read")
+    for name, text, verdict in (
+        ("a list", b"[1, 2]", "read"),
+        ("empty", b" ", "read"),
+        ("no text", b"\xff\xfe\xff", "refused"),
+        ("billion laughs", b"a: &a [x, x]\nb: &b [*a, *a]\nprojector_type: [*b, *b]", "any"),
+        ("a tag", b"!!python/object/apply:os.system ['true']", "refused"),
+        ("deep", b"[" * 5000, "refused"),
+    ):
+        yield Case(f"lanelet/projector is {name}", {"a.osm": place(), "map_projector_info.yaml": text}, verdict)  # type: ignore[arg-type]
+
+
 def pbf_cases() -> Iterator[Case]:
     """Blocks whose lengths and contents lie."""
 
@@ -934,6 +998,7 @@ def network_cases() -> Iterator[Case]:
 ACCORDING_TO_KIND = (
     yaml_cases,
     xml_cases,
+    lanelet_cases,
     pbf_cases,
     json_cases,
     picture_cases,

@@ -1,0 +1,1310 @@
+"""lanelet2: roads and footways as lanes between a left and a right bound, in an OSM file (Lanelet2, Autoware).
+
+Points, linestrings (ways) and relations: lanelets (``type=lanelet``, members ``left``, ``right``, now and then
+``centerline`` and ``regulatory_element``), areas (``type=multipolygon``) and regulatory elements. Source: Lanelet2's
+documentation (LaneletAndAreaTagging, LinestringTagging) and its reader (OsmHandlerLoad); Autoware's further tags
+``local_x``, ``local_y`` (metres in the frame that ``map_projector_info.yaml`` beside the map names) and ``ele``.
+
+Reading. Each lanelet is a directed edge ``l<id>`` along its own centreline or the line half-way between its bounds,
+two (``l<id>:back``) where it may be used both ways: where ``one_way`` says no, and, where nothing is said, where it is
+for pedestrians only. Nodes are where lanelets meet as Lanelet2 means it: both bounds of one end where both bounds of
+the next one begin; ``n<left>:<right>`` by the ids of the two points. (Where a lanelet for both ways ends, one may turn:
+its two ends in Lanelet2's sense are one node.) ``width`` is the least distance of the bounds
+(or what the lanelet says), ``speed_limit`` is in m/s. A lanelet's id and tags stand in the edge's
+``properties.lanelet2``, a node's two ``points`` in the node's.
+
+Everything else, and the lanelets once more so that they come back whole, is an object of the family ``lanelet2``:
+points that are no mere bends ``n<id>``, ways ``w<id>``, relations ``r<id>``, ``kind`` being their type. Their
+``properties.lanelet2`` holds ``tags``, further ``attributes``, ``refs`` and ``members``, the indexes of ``missing``
+points, ``children`` that OSM does not know, and of a way's mere bends the ``vertices``, parallel to ``refs`` (one for
+all where they are alike): ``tags``, ``attributes``, and the ``at`` of points that say their metres too.
+
+Places are on earth, but metres where the projector is ``Local``: there ``local_x`` and ``local_y`` count, as in
+Autoware.
+
+Writing. A lanelet comes back while its edges are in the network as it draws them; where one direction is gone, the
+other one is left. Any other edge becomes a new lanelet with bounds at half its width, an edge and its way back one
+lanelet with ``one_way=no``; lanelets that meet share points of their bounds as far as the geometry lets them. So that
+a network comes back as it was, such a lanelet has a centreline and the tags ``fleetmap:edge``, ``fleetmap:back``,
+``fleetmap:source`` and ``fleetmap:target``, and each node is a point with the tag ``fleetmap:node``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.errors import Invalid, MissingDatum, Problem, TooLarge, UnreadableFile
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _lanes, _osm_text, _yaml, register
+from app.formats._lanes import Arm, Array, Border
+from app.formats._network import AMONG_PARTS, Edge, Net, joined, own
+from app.formats._osm import INT64, Data, Tags, Way, parse
+from app.formats._osm_text import NOTHING, as_texts, attribute_text, element_id, integers
+from app.formats._text import number
+from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, unique_ids
+from app.model.frame import MAX_DATUM_LATITUDE, MAX_METRES, Anchor, Datum
+from app.model.geodesy import local_frame
+from app.model.layers import NETWORK, Layers, Part, PartKey
+from app.parameters import parameter
+
+NAME = "lanelet2"
+MAIN = "lanelet2.osm"
+PROJECTOR = "map_projector_info.yaml"
+GENERATOR = "Fleet Map Server"
+
+EDGE, BACK, SOURCE, TARGET, NODE = (f"fleetmap:{w}" for w in ("edge", "back", "source", "target", "node"))
+"""Our own tags: with them a network from elsewhere comes back with its ids."""
+
+LOCAL = ("local_x", "local_y")
+PLAIN_TAGS = frozenset({*LOCAL, "ele", "mgrs_code"})
+"""Tags of points that only say where they are."""
+
+ON_FOOT = frozenset({"walkway", "crosswalk", "stairs"})
+"""Subtypes for pedestrians only, who may go both ways (Lanelet2: LaneletAndAreaTagging)."""
+
+SUBTYPES: Mapping[str, str] = {
+    **dict.fromkeys(("footway", "path", "pedestrian", "corridor"), "walkway"),
+    "crossing": "crosswalk",
+    "steps": "stairs",
+    "cycleway": "bicycle_lane",
+    "motorway": "highway",
+    "motorway_link": "highway",
+    "trunk": "highway",
+    "living_street": "play_street",
+    "busway": "bus_lane",
+}
+"""What OSM's ``highway`` is called here; any other one is a road."""
+
+SAME_PLACE = {"wgs84": 1e-9, "local": 1e-4}
+"""Degrees and metres: an edge whose bends are nearer to its lanelet's middle than this lies there still."""
+
+UNITS = {"m/s": 1.0, "mps": 1.0, "mph": 0.44704, "m/h": 0.44704, "kmh": 1 / 3.6, "km/h": 1 / 3.6, "kph": 1 / 3.6}
+"""Metres per second; without a unit kilometres an hour are meant (Lanelet2: Attribute)."""
+
+CANONICAL_EDGE = frozenset({"kind", "name", "source", "target", "speed_limit", "width", NAME}) | AMONG_PARTS
+CANONICAL_NODE = frozenset({"kind", "name", NAME}) | AMONG_PARTS
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What new lanelets are given where the network does not say it."""
+
+    width: float = parameter(1.0, "width of lanes whose edge has none", minimum=0.01, maximum=100.0, unit="m")
+    subtype: str = parameter("road", "subtype of lanes whose source names none: road, walkway, crosswalk …")
+    location: str = parameter("urban", "location of new lanes: urban or nonurban")
+    projector_info: bool = parameter(
+        False, "also write map_projector_info.yaml (Local: local_x and local_y are metres in the environment's frame)"
+    )
+
+
+@dataclass(slots=True)
+class Lane:
+    """A lanelet as its relation says it; bounds as node ids."""
+
+    id: int
+    tags: Mapping[str, str]
+    left: list[int]
+    right: list[int]
+    middle: list[int] | None = None
+
+
+# --- the network that lanelets make: reader and writer must agree on it ------------------------------------------
+
+
+@dataclass(slots=True)
+class Places:
+    """Where points are. row: node id -> row of ``xyz``, [n, 3] as they are anchored, z NaN where none is said."""
+
+    row: dict[int, int]
+    xyz: Array
+    anchor: Anchor
+    names: dict[str, int] = field(default_factory=dict)
+    labels: dict[str, str] = field(default_factory=dict)
+
+    def metres(self) -> Array:
+        """[n, 2]; on earth in a frame near the middle of the data, which is right to a few parts in 100 000."""
+        if self.anchor == "local" or not len(self.xyz):
+            return self.xyz[:, :2]
+        lonlat = self.xyz[:, :2]
+        low, high = lonlat.min(axis=0), lonlat.max(axis=0)
+        # A tenth of a degree: an edit at the map's edge must not move the frame and so every digit of the others.
+        lon, lat = np.round((low + high) / 2.0, 1).tolist()
+        frame = local_frame(Datum(float(np.clip(lat, -MAX_DATUM_LATITUDE, MAX_DATUM_LATITUDE)), lon))
+        xy = frame.to_local(lonlat)
+        if not (np.abs(xy) <= MAX_METRES).all():
+            reason = "the lanes spread over too much of the earth to be one network: give those of one site"
+            raise Invalid(reason, [Problem(reason)])
+        return xy
+
+
+def network(lanes: Sequence[Lane], places: Places, document: Properties) -> Features:
+    """Nodes and directed edges of lanelets, all of whose points have a place."""
+    marks = _Ends()
+    rows: list[tuple[Lane, tuple[int, int], tuple[int, int], bool]] = []
+    ids: list[str] = []
+    geometry: list[Any] = []
+    properties: list[Properties] = []
+    if lanes:
+        xy = places.metres()
+        left, right = (_lanes.runs([[places.row[r] for r in side] for side in sides]) for sides in _bounds(lanes))
+        left, right = _lanes.aligned(left, right, xy)
+        lines, widths = _middles(lanes, left, right, places, xy)
+        node_ids = {row: i for i, row in places.row.items()}
+        begins = [(node_ids[a], node_ids[b]) for a, b in zip(left.begin.tolist(), right.begin.tolist(), strict=True)]
+        ends = [(node_ids[a], node_ids[b]) for a, b in zip(left.end.tolist(), right.end.tolist(), strict=True)]
+        for lane, a, b in zip(lanes, begins, ends, strict=True):
+            both = two_way(lane.tags)
+            rows.append((lane, a, b, both))
+            for pair in (a, b):
+                marks.add(pair, both)
+    known = set(places.names)
+    where: dict[tuple[int, int], str] = {}
+    for pair in marks.all():
+        top = marks.find(pair)
+        if top not in where:
+            where[top] = f"n{top[0]}:{top[1]}"
+    # A node that our own tags name stands where it stood; every other one in the middle between its two points.
+    used: dict[str, tuple[int, int] | None] = dict.fromkeys(places.names)
+    edges: list[tuple[str, Any, Properties]] = []
+    for k, (lane, a, b, both) in enumerate(rows):
+        names = lane.tags.get(SOURCE, ""), lane.tags.get(TARGET, "")
+        source, target = (
+            name if name in known else where[marks.find(pair)] for name, pair in zip(names, (a, b), strict=True)
+        )
+        for name, pair in ((source, a), (target, b)):
+            if name not in known:
+                used.setdefault(name, marks.find(pair))
+        said: dict[str, Any] = {"kind": "edge", "source": source, "target": target}
+        if title := lane.tags.get("name") or lane.tags.get("road_name"):
+            said["name"] = title
+        if widths[k] is not None:
+            said["width"] = widths[k]
+        if (speed := speed_of(lane.tags.get("speed_limit"))) is not None:
+            said["speed_limit"] = speed
+        said[NAME] = {"lanelet": lane.id, "tags": dict(lane.tags)}
+        edges.append((lane.tags.get(EDGE) or f"l{lane.id}", lines[k], said))
+        if both:
+            back = {**said, "source": target, "target": source}
+            edges.append((lane.tags.get(BACK) or f"l{lane.id}:back", shapely.reverse(lines[k]), back))
+    for name, pair_ in used.items():
+        if pair_ is None:
+            at = places.xyz[places.row[places.names[name]]]
+            label = places.labels.get(name)
+            properties.append({"kind": "node", "name": label or name, NAME: {"point": places.names[name]}})
+        else:
+            at = (places.xyz[places.row[pair_[0]]] + places.xyz[places.row[pair_[1]]]) / 2.0
+            properties.append({"kind": "node", NAME: {"points": list(pair_)}})
+        ids.append(name)
+        geometry.append(shapely.Point(*at[:2].tolist()) if math.isnan(at[2]) else shapely.Point(*at.tolist()))
+    ids = unique_ids([*ids, *(i for i, _, _ in edges)])
+    out = np.empty(len(ids), object)
+    out[:] = [*geometry, *(line for _, line, _ in edges)]
+    return from_columns(ids, out, [*properties, *(p for _, _, p in edges)], places.anchor, document)
+
+
+def _bounds(lanes: Sequence[Lane]) -> tuple[list[list[int]], list[list[int]]]:
+    return [lane.left for lane in lanes], [lane.right for lane in lanes]
+
+
+def _middles(
+    lanes: Sequence[Lane], left: _lanes.Runs, right: _lanes.Runs, places: Places, xy: Array
+) -> tuple[list[Any], list[float | None]]:
+    """Of each lane its middle as a line, and its width in metres, None where the bounds touch."""
+    high = ~np.isnan(places.xyz[:, 2])
+    values = np.where(np.isnan(places.xyz), 0.0, places.xyz)
+    points, owner = _lanes.middles(left, right, xy, values)
+    points = np.round(points, 12 if places.anchor == "wgs84" else 9)
+    deep = np.zeros(len(lanes), bool)
+    for side in (left, right):
+        np.logical_or.at(deep, side.owner, high[side.at])
+    flat = np.asarray(shapely.linestrings(points[:, :2], indices=owner), object).reshape(len(lanes))
+    lines = flat
+    if deep.any():
+        lines = np.where(deep, np.asarray(shapely.linestrings(points, indices=owner), object), flat)
+    out = lines.tolist()
+    for k, lane in enumerate(lanes):
+        if lane.middle is not None:
+            rows = [places.row[r] for r in lane.middle]
+            said = values[rows] if high[rows].any() else places.xyz[rows, :2]
+            out[k] = shapely.LineString(said)
+    sides = [
+        np.asarray(shapely.linestrings(xy[s.at], indices=s.owner), object).reshape(len(lanes)) for s in (left, right)
+    ]
+    apart = shapely.distance(*sides).tolist()
+    widths = []
+    for lane, width in zip(lanes, apart, strict=True):
+        # Where we made the bounds, the edge's width is in a tag; without one their distance is no information.
+        between = round(width, 6) if width >= 0.01 and EDGE not in lane.tags else None
+        said_width = _positive(lane.tags.get("width"))
+        widths.append(between if said_width is None else said_width)
+    return out, widths
+
+
+class _Ends:
+    """Which ends of lanes are one node. An end is its (left, right) points, looking along the lane; on a lane that may
+    be used both ways it is also (right, left)."""
+
+    def __init__(self) -> None:
+        self.parent: dict[tuple[int, int], tuple[int, int]] = {}
+
+    def add(self, pair: tuple[int, int], both: bool) -> None:
+        a = self.find(pair)
+        if both:
+            b = self.find((pair[1], pair[0]))
+            # The smaller one stands for both, so that a node's id does not depend on the order of lanelets.
+            self.parent[max(a, b)] = min(a, b)
+
+    def find(self, pair: tuple[int, int]) -> tuple[int, int]:
+        top = self.parent.setdefault(pair, pair)
+        while self.parent[top] != top:
+            top = self.parent[top]
+        self.parent[pair] = top
+        return top
+
+    def all(self) -> list[tuple[int, int]]:
+        return list(self.parent)
+
+
+def two_way(tags: Mapping[str, str]) -> bool:
+    """Whether a lanelet may be used both ways (Lanelet2: LaneletAndAreaTagging, "Direction")."""
+    said = _truth(tags.get("one_way"))
+    if said is not None:
+        return not said
+    allowed = {k.removeprefix("participant:") for k, v in tags.items() if k.startswith("participant:") and _truth(v)}
+    on_foot = allowed == {"pedestrian"} if allowed else tags.get("subtype") in ON_FOOT
+    special = {k.removeprefix("one_way:"): _truth(v) for k, v in tags.items() if k.startswith("one_way:")}
+    if on_foot:
+        return not special.get("pedestrian", False)
+    # One participant's right to go back is not everybody's.
+    return bool(allowed) and all(special.get(who) is False for who in allowed)
+
+
+def _truth(value: str | None) -> bool | None:
+    word = (value or "").strip().lower()
+    return True if word in ("yes", "true", "1") else False if word in ("no", "false", "0") else None
+
+
+_SPEED = re.compile(r"\s*(\d{1,9}(?:\.\d{1,20})?)\s*([A-Za-z/]*)\s*", re.ASCII)
+
+
+def speed_of(text: str | None) -> float | None:
+    """Metres per second, or None for what is no speed."""
+    match = _SPEED.fullmatch(text or "")
+    if match is None:
+        return None
+    unit = UNITS.get(match[2].lower()) if match[2] else 1 / 3.6
+    return None if unit is None else round(float(match[1]) * unit, 9)
+
+
+def _decimal(text: Any) -> float:
+    """A finite number within the bound of local coordinates, else NaN."""
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        return math.nan
+    return value if abs(value) <= MAX_METRES else math.nan
+
+
+def _positive(text: Any) -> float | None:
+    value = _decimal(text)
+    return value if value > 0 else None
+
+
+def _is_gone(attributes: Mapping[str, Any]) -> bool:
+    return attributes.get("action") == "delete" or attributes.get("visible") == "false"
+
+
+def lanes_of(
+    relations: Iterable[tuple[int, Sequence[Sequence[Any]], Mapping[str, str], Mapping[str, str]]],
+    ways: Mapping[int, tuple[Sequence[int], Mapping[str, str]]],
+    located: Mapping[int, Any],
+) -> tuple[list[Lane], list[tuple[int, str]]]:
+    """The lanelets that can be followed, and of the others why not. relations: (id, members, tags, attributes)."""
+    out, broken = [], []
+    for i, members, tags, attributes in relations:
+        if tags.get("type") != "lanelet":
+            continue
+        if _is_gone(attributes):
+            broken.append((i, "it is marked as deleted"))
+            continue
+        sides: dict[str, list[list[int]]] = {"left": [], "right": [], "centerline": []}
+        for kind, ref, role in members:
+            if kind == "way" and role in sides and ref in ways and not _is_gone(ways[ref][1]):
+                sides[role].append([r for r in ways[ref][0] if r in located])
+        if any(len(sides[s]) != 1 or len(sides[s][0]) < 2 for s in ("left", "right")):
+            broken.append((i, "it needs one left and one right bound of two and more points each"))
+            continue
+        middle = sides["centerline"][0] if len(sides["centerline"]) == 1 and len(sides["centerline"][0]) > 1 else None
+        out.append(Lane(i, tags, sides["left"][0], sides["right"][0], middle))
+    return out, broken
+
+
+# --- reading -----------------------------------------------------------------------------------------------------
+
+_LANELET = re.compile(
+    rb"""<tag\s+(?:k\s*=\s*["']type["']\s+v\s*=\s*["']lanelet["']|v\s*=\s*["']lanelet["']\s+k\s*=\s*["']type["'])\s*/?>"""
+)
+_ROOT = re.compile(rb"<osm[\s>]")
+
+
+def detect(name: str, data: bytes) -> bool:  # noqa: ARG001
+    """An ``<osm>`` file with a lanelet in it."""
+    return b"lanelet" in data and _ROOT.search(data[:4096]) is not None and _LANELET.search(data) is not None
+
+
+def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:  # noqa: ARG001
+    """Autoware's file about the projection, which stands beside the map."""
+    folder = main.rpartition("/")[0]
+    return [n for n in names if n == f"{folder}/{PROJECTOR}".lstrip("/")]
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """The network of lanelets, and all elements as objects, on earth (in metres where the projector is ``Local``).
+
+    Raises UnreadableFile, with a line where there is one, for what is no OSM file and for places that are not on earth.
+    """
+    data = parse(files[context.main], context.limits)
+    total = len(data.ids) + len(data.ways) + len(data.relations)
+    if total > context.limits.features:
+        raise TooLarge(f"the file has {total} elements; the limit is {context.limits.features}")
+    for problem, line, where in data.problems:
+        context.warn(problem, line=line, where=where)
+    said: dict[str, Any] = {"attributes": data.root}
+    if data.bounds:
+        said["bounds"] = data.bounds
+    if data.elements:
+        said["elements"] = [[name, attributes, text] for name, attributes, text in data.elements]
+    projector = next((n for n in files if n != context.main), None)
+    local = _has_only_metres(data)
+    if projector is not None:
+        said["projector"] = _projector_text(files[projector], projector)
+        local = _projector_type(files[projector], projector, context) == "local" or local
+    reader = _Reader(data, context, local)
+    parts: dict[PartKey, Part] = {}
+    if context.wants("topology"):
+        made = reader.network()
+        if len(made):
+            parts[PartKey("topology", context.level, NETWORK)] = made
+    if context.wants("objects") or not parts:
+        parts[PartKey("objects", context.level, NAME)] = reader.objects({NAME: said})
+    return Layers(parts)
+
+
+def _has_only_metres(data: Data) -> bool:
+    """Whether no point stands on earth and some say their metres: Autoware's maps without a projection."""
+    metres = any(LOCAL[0] in tags for tags in data.tags.values())
+    return metres and bool(np.isnan(data.lonlat[:, 0]).all())
+
+
+def _projector_text(data: bytes, name: str) -> str:
+    if len(data) > 2**16:
+        raise TooLarge(f"{name} has {len(data)} bytes; 65536 are the limit", [Problem("too large", name)])
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise UnreadableFile(f"{name} is not UTF-8 text", [Problem("not UTF-8 text", name)]) from error
+
+
+def _projector_type(data: bytes, name: str, context: ReadContext) -> str:
+    try:
+        said = _yaml.load(data, context.limits)
+    except UnreadableFile as error:
+        problems = [Problem(p.problem, name, p.line, p.where) for p in error.problems]
+        raise UnreadableFile(f"{name}: {error.detail}", problems) from error
+    kind = said.get("projector_type") if isinstance(said, dict) else None
+    if not isinstance(kind, str):
+        context.warn("it names no projector_type: places on earth are believed", file=name)
+        return ""
+    return kind.lower()
+
+
+class _Reader:
+    def __init__(self, data: Data, context: ReadContext, local: bool) -> None:
+        self.data, self.context = data, context
+        self.anchor: Anchor = "local" if local else "wgs84"
+        row = {i: k for k, i in enumerate(data.ids)}
+        self.ways = {way.id: way for way in data.ways}
+        self.relations = {r.id: r for r in data.relations}
+        for what, distinct, all_ids in (
+            ("node", row, data.ids),
+            ("way", self.ways, data.ways),
+            ("relation", self.relations, data.relations),
+        ):
+            if len(distinct) != len(all_ids):
+                context.warn("ids stand more than once in the file; the last one counts", where=what)
+        self.row = row
+        xyz = np.full((len(data.ids), 3), np.nan)
+        if not local:
+            xyz[:, :2] = data.lonlat
+        doubts: Counter[str] = Counter()
+        for k, tags in data.tags.items():
+            if local:
+                xyz[k, :2] = _decimal(tags.get(LOCAL[0])), _decimal(tags.get(LOCAL[1]))
+            if "ele" in tags:
+                xyz[k, 2] = _decimal(tags["ele"])
+                doubts["elevations are no numbers of metres and not believed"] += math.isnan(xyz[k, 2])
+        lost = np.isnan(xyz[:, :2]).any(axis=1)
+        xyz[lost] = np.nan
+        doubts["points have no place; references to them are kept"] += int(lost.sum())
+        for text, times in doubts.items():
+            if times:
+                context.warn(f"{times} {text}")
+        self.xyz = xyz
+        self.located = {i: k for i, k in row.items() if not lost[k]}
+
+    def network(self) -> Features:
+        relations = ((r.id, r.members, r.tags, r.attributes) for r in self.relations.values())
+        ways = {i: (way.refs, way.attributes) for i, way in self.ways.items()}
+        lanes, broken = lanes_of(relations, ways, self.located)
+        for i, reason in broken:
+            self.context.warn(f"the lanelet is no part of the network: {reason}", where=f"relation {i}")
+        if not lanes:
+            self.context.warn("the file has no lanelets that could be followed, so there is no network in it")
+        names: dict[str, int] = {}
+        labels: dict[str, str] = {}
+        for k, tags in self.data.tags.items():
+            name = tags.get(NODE)
+            if name and self.data.ids[k] in self.located:
+                names.setdefault(name, self.data.ids[k])
+                labels.setdefault(name, tags.get("name", ""))
+        try:
+            return network(lanes, _table(self.located, self.xyz, self.anchor, names, labels), {})
+        except Invalid as error:
+            raise UnreadableFile(error.detail, list(error.problems)) from error
+
+    def objects(self, document: Properties) -> Features:
+        """Points that are no mere bends, ways and relations."""
+        data = self.data
+        members = {i for r in self.relations.values() for kind, i, _ in r.members if kind == "node"}
+        bent = set(chain.from_iterable(way.refs for way in self.ways.values()))
+        lone = []
+        for i, k in self.row.items():
+            tags = data.tags.get(k, {})
+            special = i not in bent or i in members or i not in self.located or not tags.keys() <= PLAIN_TAGS
+            if special or k in data.node_children or _is_gone(data.attributes(k)):
+                lone.append(k)
+        ids = [f"n{data.ids[k]}" for k in lone]
+        geometry: list[Any] = [self.point(k) for k in lone]
+        properties: list[Properties] = []
+        for k in lone:
+            tags = data.tags.get(k, {})
+            said = self.bend(k)
+            if children := data.node_children.get(k):
+                said["children"] = [list(c) for c in children]
+            properties.append(_properties(said, tags, "point"))
+        special_ids = {data.ids[k] for k in lone}
+        deep = ~np.isnan(self.xyz[:, 2])
+        for way in self.ways.values():
+            said = self.way(way, special_ids)
+            ids.append(f"w{way.id}")
+            geometry.append(self.line(way, deep))
+            properties.append(_properties(said, way.tags, "line"))
+        for r in self.relations.values():
+            said = {"members": [list(m) for m in r.members], "tags": r.tags}
+            if r.attributes:
+                said["attributes"] = r.attributes
+            if r.children:
+                said["children"] = [list(c) for c in r.children]
+            ids.append(f"r{r.id}")
+            geometry.append(NO_GEOMETRY)
+            properties.append(_properties(said, r.tags, "relation"))
+        out = np.empty(len(geometry), object)
+        out[:] = geometry
+        return from_columns(ids, out, properties, self.anchor, document)
+
+    def point(self, k: int) -> Any:
+        x, y, z = self.xyz[k].tolist()
+        if math.isnan(x):
+            return NO_GEOMETRY
+        return shapely.Point(x, y) if math.isnan(z) else shapely.Point(x, y, z)
+
+    def line(self, way: Way, deep: Any) -> Any:
+        rows = [self.located[r] for r in way.refs if r in self.located]
+        if not rows:
+            return NO_GEOMETRY
+        at = self.xyz[rows]
+        at = np.where(np.isnan(at), 0.0, at) if deep[rows].any() else at[:, :2]
+        return shapely.LineString(at) if len(rows) > 1 else shapely.Point(*at[0])
+
+    def way(self, way: Way, special: set[int]) -> dict[str, Any]:
+        said: dict[str, Any] = {"refs": way.refs, "tags": way.tags}
+        if way.attributes:
+            said["attributes"] = way.attributes
+        if missing := [k for k, r in enumerate(way.refs) if r not in self.located]:
+            said["missing"] = missing
+        if not way.refs and not _is_gone(way.attributes):
+            self.context.warn("the way has no nodes", where=f"way {way.id}")
+        bends = [None if r in special or r not in self.row else self.bend(self.row[r]) for r in way.refs]
+        mere = [b for b in bends if b is not None]
+        if any(mere):
+            said["vertices"] = mere[0] if all(b == mere[0] for b in mere) else bends
+        if way.children:
+            said["children"] = [list(c) for c in way.children]
+        return said
+
+    def bend(self, k: int) -> dict[str, Any]:
+        """What is known of a point beside its place."""
+        said: dict[str, Any] = {}
+        tags = self.data.tags.get(k)
+        if tags:
+            said["tags"] = tags
+        if attributes := self.data.attributes(k):
+            said["attributes"] = attributes
+        if (tags and LOCAL[0] in tags) or self.anchor == "local":
+            at = self.data.lonlat[k].tolist()
+            if not math.isnan(at[0]):
+                said["at"] = at
+        return said
+
+
+def _table(
+    located: Mapping[int, int], xyz: Array, anchor: Anchor, names: dict[str, int], labels: dict[str, str]
+) -> Places:
+    """Only points with a place, so that nothing else can be meant."""
+    rows = list(located.values())
+    return Places({i: k for k, i in enumerate(located)}, xyz[rows].reshape(-1, 3), anchor, names, labels)
+
+
+def _properties(said: dict[str, Any], tags: Tags, otherwise: str) -> Properties:
+    kind = tags.get("type") or otherwise
+    if otherwise == "relation" and kind == "multipolygon":
+        kind = "area"
+    name = tags.get("name")
+    return {"kind": kind, "name": name, NAME: said} if name else {"kind": kind, NAME: said}
+
+
+# --- writing -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Point:
+    """A point that is written. at: (lon, lat) as its source said them where the file says metres too, else None."""
+
+    xyz: tuple[float, float, float]
+    local: bool
+    tags: Mapping[str, str] = field(default_factory=dict)
+    attributes: Mapping[str, str] = field(default_factory=dict)
+    at: tuple[float, float] | None = None
+    stored: bool = True
+    vertex: bool = False
+
+
+@dataclass(slots=True)
+class _Level:
+    """How the elements of one level are called in the file: stored id -> id."""
+
+    nodes: dict[int, int] = field(default_factory=dict)
+    ways: dict[int, int] = field(default_factory=dict)
+    relations: dict[int, int] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class _New:
+    """A lanelet to be made: its middle [k, 3] in metres, the edge along it, and the edge back, if it is two-way."""
+
+    middle: Array
+    half: float
+    edge: Edge
+    back: Edge | None
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``lanelet2.osm``, and ``map_projector_info.yaml`` where the source had one or it is asked for.
+
+    Raises MissingDatum where a network is in metres and there is no datum.
+    """
+    out = _Writer(layers, context)
+    for level in dict.fromkeys(key.level for key in sorted(layers.parts)):
+        out.level(level)
+    out.add_network()
+    files = {MAIN: out.text().encode()}
+    if out.projector is not None:
+        files[PROJECTOR] = out.projector.encode()
+    elif context.options.projector_info:
+        files[PROJECTOR] = b"projector_type: Local\nvertical_datum: WGS84\n"
+    return files
+
+
+class _Writer:
+    def __init__(self, layers: Layers, context: WriteContext) -> None:
+        self.layers, self.context = layers, context
+        self.options: WriteOptions = context.options
+        self.points: dict[int, _Point] = {}
+        self.ways: dict[int, tuple[list[int], Mapping[str, str], Mapping[str, str]]] = {}
+        self.relations: dict[int, tuple[list[tuple[str, int, str]], Mapping[str, str], Mapping[str, str]]] = {}
+        self.levels: dict[str, _Level] = {}
+        self.lost: Counter[str] = Counter()
+        self.explained: dict[PartKey, set[str]] = {}
+        self.moved: dict[PartKey, set[str]] = {}
+        mine = [part for key, part in layers.vector("objects").items() if key.name == NAME]
+        self.documents = [said for part in mine if isinstance(said := part.document.get(NAME), Mapping)]
+        self.projector = next((s for d in self.documents if isinstance(s := d.get("projector"), str)), None)
+        self.metric = any(part.local.any() for part in mine)
+        rows = [own(p, NAME) for part in mine for p in part.properties]
+        self.taken = {k[1] for part in mine for i in part.ids if (k := element_id(i))}
+        self.taken.update(chain.from_iterable(integers(said.get("refs")) or () for said in rows))
+        self.counter = 0
+        # In a map whose metres are another frame's, new points say only where on earth they are.
+        self.say_metres = self.metric or not any(LOCAL[0] in as_texts(t) for said in rows for t in _all_tags(said))
+
+    def fresh(self) -> int:
+        """A new id; points, ways and relations share one row of numbers."""
+        self.counter += 1
+        while self.counter in self.taken:
+            self.counter += 1
+        self.taken.add(self.counter)
+        return self.counter
+
+    # --- what was read ---
+
+    def level(self, name: str) -> None:
+        level = self.levels[name] = _Level()
+        part = next((p for k, p in self.layers.vector("objects", name).items() if k.name == NAME), None)
+        networks = self.layers.vector("topology", name)
+        nodes = {i for n in networks.values() for i, p in zip(n.ids, n.properties, strict=True) if p["kind"] == "node"}
+        if part is None or not len(part):
+            return
+        mixed = part.local.any() and not part.local.all()
+        geometry = part.in_wgs84(self.layers.frame) if mixed else part.geometry
+        local = bool(part.local.all())
+        rows = [
+            (known[0], known[1], shape, own(p, NAME))
+            for i, shape, p in zip(part.ids, geometry, part.properties, strict=True)
+            if (known := element_id(i)) and NAME in p
+        ]
+        self.lost["objects that are no element of a map"] += len(part) - len(rows)
+        for what, i, shape, said in rows:
+            if what == "n":
+                self.point(level, i, shape, said, local, nodes if networks else None)
+        for what, i, shape, said in rows:
+            if what == "w":
+                self.way(level, i, shape, said, local)
+        relations = [(i, said) for what, i, _, said in rows if what == "r"]
+        for i, _ in relations:
+            level.relations[i] = self.fresh() if i in self.relations else i
+            self.relations[level.relations[i]] = ([], NOTHING, NOTHING)
+        said_of = self.lanelets(part, geometry, local, relations, networks)
+        for i, said in relations:
+            self.relation(level, i, said, said_of.get(i, (NOTHING, False)))
+
+    def point(
+        self, level: _Level, i: int, shape: Any, said: Mapping[str, Any], local: bool, nodes: set[str] | None
+    ) -> None:
+        xyz = _xyz(shape)
+        new = self.fresh() if i in self.points else i
+        tags = as_texts(said.get("tags"))
+        if nodes is not None and NODE in tags and tags[NODE] not in nodes:
+            tags = {k: v for k, v in tags.items() if k != NODE}
+        self.points[new] = _Point(xyz, local, tags, as_texts(said.get("attributes")), _pair(said.get("at")))
+        level.nodes[i] = new
+        self.children(said)
+
+    def way(self, level: _Level, i: int, shape: Any, said: Mapping[str, Any], local: bool) -> None:
+        refs = integers(said.get("refs"))
+        at = _course(shape)
+        new = level.ways[i] = self.fresh() if i in self.ways else i
+        self.children(said)
+        tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
+        missing = set(integers(said.get("missing")) or ())
+        if refs is None or len(refs) - len(missing) != len(at):
+            self.ways[new] = (self.redrawn(level, refs or [], at, local), tags, attributes)
+            return
+        bends = said.get("vertices")
+        rows = bends if isinstance(bends, list) and len(bends) == len(refs) else [bends] * len(refs)
+        out, j = [], 0
+        for k, ref in enumerate(refs):
+            name = level.nodes.get(ref, ref)
+            if k not in missing:
+                known = self.points.get(name)
+                bend: Mapping[str, Any] = row if isinstance(row := rows[k], Mapping) else {}
+                if known is None or (ref not in level.nodes and not _same(known.xyz, at[j])):
+                    # Two ways that no longer agree where their common point is keep their course each.
+                    if known is not None:
+                        name = self.fresh()
+                    tags_, said_ = as_texts(bend.get("tags")), as_texts(bend.get("attributes"))
+                    place = _pair(bend.get("at"))
+                    self.points[name] = _Point(at[j], local, tags_, said_, place, vertex=True)
+                    if known is None:
+                        level.nodes[ref] = name
+                elif known.vertex and not _same(known.xyz, at[j]):
+                    name = self.fresh()
+                    self.points[name] = _Point(at[j], local, vertex=True)
+                j += 1
+            out.append(name)
+        self.ways[new] = (out, tags, attributes)
+
+    def redrawn(self, level: _Level, refs: list[int], at: list[tuple[float, float, float]], local: bool) -> list[int]:
+        """Points for a way whose geometry was edited: its own where one stands at a bend, else new ones."""
+        names = (level.nodes.get(r, r) for r in refs)
+        known = {self.points[n].xyz[:2]: n for n in names if n in self.points}
+        out = []
+        for place in at:
+            if place[:2] not in known:
+                known[place[:2]] = new = self.fresh()
+                self.points[new] = _Point(place, local, vertex=True)
+            out.append(known[place[:2]])
+        return out
+
+    def children(self, said: Mapping[str, Any]) -> None:
+        if isinstance(said.get("children"), list):
+            self.lost["elements that OSM does not know"] += len(said["children"])
+
+    def lanelets(
+        self,
+        part: Features,
+        geometry: Any,
+        local: bool,
+        relations: Sequence[tuple[int, Mapping[str, Any]]],
+        networks: Mapping[PartKey, Features],
+    ) -> dict[int, tuple[Mapping[str, str], bool] | None]:
+        """What the network says of each lanelet: its tags and whether it goes the other way round now; None where its
+        edges are gone. Without a network nothing is said of any."""
+        if not networks:
+            return {}
+        ways: dict[int, tuple[list[int], Mapping[str, str]]] = {}
+        row: dict[int, int] = {}
+        xyz: list[tuple[float, float, float]] = []
+        names: dict[str, int] = {}
+        labels: dict[str, str] = {}
+        for i, shape, p in zip(part.ids, geometry, part.properties, strict=True):
+            known, said = element_id(i), own(p, NAME)
+            if known and known[0] == "n" and not shape.is_empty:
+                row[known[1]] = len(xyz)
+                xyz.append(_xyz(shape))
+                tags = as_texts(said.get("tags"))
+                if tags.get(NODE):
+                    names.setdefault(tags[NODE], known[1])
+                    labels.setdefault(tags[NODE], tags.get("name", ""))
+        for i, shape, p in zip(part.ids, geometry, part.properties, strict=True):
+            known, said = element_id(i), own(p, NAME)
+            refs, at = integers(said.get("refs")), _course(shape)
+            if not known or known[0] != "w" or refs is None:
+                continue
+            missing = set(integers(said.get("missing")) or ())
+            there = [r for k, r in enumerate(refs) if k not in missing]
+            if len(there) != len(at):
+                continue
+            ways[known[1]] = (there, as_texts(said.get("attributes")))
+            for r, place in zip(there, at, strict=True):
+                if r not in row:
+                    row[r] = len(xyz)
+                    xyz.append(place)
+        rows = (
+            (i, _members(said), as_texts(said.get("tags")), as_texts(said.get("attributes"))) for i, said in relations
+        )
+        lanes, _ = lanes_of(rows, ways, row)
+        table = Places(row, np.array(xyz, np.float64).reshape(-1, 3), "local" if local else "wgs84", names, labels)
+        drawn = network(lanes, table, {})
+        return self.compared(lanes, drawn, networks)
+
+    def compared(
+        self, lanes: Sequence[Lane], drawn: Features, networks: Mapping[PartKey, Features]
+    ) -> dict[int, tuple[Mapping[str, str], bool] | None]:
+        """Lanelets as the networks have them now. drawn: the network that the lanelets make by themselves."""
+        place = drawn.index()
+        there: dict[str, Properties] = {}
+        for key, net in networks.items():
+            near = SAME_PLACE["local" if bool(drawn.local.all()) else "wgs84"]
+            own_rows = [(k, place[i]) for k, i in enumerate(net.ids) if i in place]
+            now, then = [k for k, _ in own_rows], [k for _, k in own_rows]
+            same = shapely.equals_exact(net.geometry[now], drawn.geometry[then], tolerance=near) if now else []
+            still = {net.ids[k] for k, ok in zip(now, same, strict=True) if ok and net.local[k] == drawn.local[0]}
+            self.moved[key] = {net.ids[k] for k in now} - still
+            known = self.explained.setdefault(key, set())
+            for k, j in own_rows:
+                p, q = net.properties[k], drawn.properties[j]
+                ends = (p.get("source"), p.get("target"))
+                if (
+                    p.get("kind") == "edge"
+                    and ends == (q.get("source"), q.get("target"))
+                    and still >= {*ends, net.ids[k]}
+                ):
+                    there[net.ids[k]] = p
+                    known.add(net.ids[k])
+        expected: dict[int, list[int]] = {}
+        for k, p in enumerate(drawn.properties):
+            if p["kind"] == "edge":
+                expected.setdefault(p[NAME]["lanelet"], []).append(k)
+        out: dict[int, tuple[Mapping[str, str], bool] | None] = {}
+        for lane in lanes:
+            edges = expected[lane.id]
+            found = [k for k in edges if drawn.ids[k] in there]
+            if not found:
+                out[lane.id] = None
+                self.lost["lanelets whose edges are no longer in the network"] += 1
+                continue
+            tags = self.edited(lane, drawn.properties[found[0]], there[drawn.ids[found[0]]])
+            if len(found) < len(edges):
+                tags = {**{k: v for k, v in tags.items() if not k.startswith("one_way:")}, "one_way": "yes"}
+            out[lane.id] = (tags, found[0] != edges[0])
+        return out
+
+    def edited(self, lane: Lane, drawn: Properties, now: Properties) -> dict[str, str]:
+        """The lanelet's tags with what the network says otherwise."""
+        tags = dict(lane.tags)
+        if now.get("speed_limit") != drawn.get("speed_limit"):
+            tags.pop("speed_limit", None)
+            if (speed := _metres_per_second(now)) is not None:
+                tags["speed_limit"] = _kmh(speed)
+        if now.get("name") != drawn.get("name"):
+            tags.pop("name", None)
+            tags.pop("road_name", None)
+            if isinstance(now.get("name"), str):
+                tags["name"] = now["name"]
+        if now.get("width") != drawn.get("width"):
+            self.lost["widths of edges that differ from the bounds of their lanelet"] += 1
+        return tags
+
+    def relation(
+        self, level: _Level, i: int, said: Mapping[str, Any], about: tuple[Mapping[str, str], bool] | None
+    ) -> None:
+        if about is None:
+            del self.relations[level.relations[i]]
+            return
+        tags, turned = about
+        members = []
+        for kind, ref, role in _members(said):
+            names = {"node": level.nodes, "way": level.ways, "relation": level.relations}.get(kind, {})
+            other = {"left": "right", "right": "left"}.get(role) if turned else None
+            members.append((kind, names.get(ref, ref), other or role))
+        stated = said.get("members")
+        self.lost["relation members that are not [type, id, role]"] += (
+            len(stated) - len(members) if isinstance(stated, list) else 0
+        )
+        self.children(said)
+        tags = tags or as_texts(said.get("tags"))
+        self.relations[level.relations[i]] = (members, tags, as_texts(said.get("attributes")))
+
+    # --- what came from elsewhere ---
+
+    def add_network(self) -> None:
+        """Lanelets for all edges that none explains, and points for nodes."""
+        parts: dict[PartKey, Part] = {}
+        for key, part in self.layers.vector("topology").items():
+            known = self.explained.get(key, set())
+            keep = [k for k, i in enumerate(part.ids) if i not in known]
+            if any(part.properties[k].get("kind") == "edge" for k in keep) or not known:
+                parts[key] = part.take(keep)
+        if not parts:
+            return
+        if self.layers.frame is None and not self.metric:
+            raise MissingDatum(
+                "lanelet2 says where on earth a network lies, and the environment has no datum: set one with PATCH "
+                '/api/v1/environments/{env} {"datum": {"latitude": …, "longitude": …}} or upload a datum.yaml'
+            )
+        net = joined(Layers(parts, self.layers.datum, self.layers.levels), self.context)
+        new = self.new_lanelets(net)
+        centres = self.node_points(net, {n for lane in new for n in (lane.edge.source, lane.edge.target)})
+        self.bounds(net, new, centres)
+        self.tell(net, new)
+
+    def tell(self, net: Net, new: Sequence[_New]) -> None:
+        """What new lanelets were given, and what they could not take."""
+        if new:
+            why = "the edges of the network say no more"
+            if default := sum("width" not in lane.edge.properties for lane in new):
+                self.context.fill("width of lanes", self.options.width, f"{default} edges say none")
+            self.context.fill("type of bounds", "virtual", why)
+            self.context.fill("location of lanelets", self.options.location, why)
+            if any(self.subtype(lane.edge) == self.options.subtype for lane in new):
+                self.context.fill("subtype of lanelets", self.options.subtype, why)
+        more = sum(bool(e.properties.keys() - CANONICAL_EDGE) for e in net.edges)
+        self.context.drop("further properties of edges", more, "lanelets have no place for them")
+        more = sum(bool(n.properties.keys() - CANONICAL_NODE) for n in net.nodes)
+        self.context.drop("further properties of nodes", more, "points have no place for them")
+        if len(set(net.levels)) > 1:
+            self.context.drop("levels of nodes", len(net.nodes), "Lanelet2 knows no levels: all networks are joined")
+
+    def new_lanelets(self, net: Net) -> list[_New]:
+        """One for each edge, one for both where an edge has a like one on the way back."""
+        waiting: dict[tuple[int, int], list[Edge]] = {}
+        for edge in net.edges:
+            waiting.setdefault((edge.source, edge.target), []).append(edge)
+        done: set[int] = set()
+        out = []
+        without = loops = 0
+        for edge in net.edges:
+            if id(edge) in done:
+                continue
+            done.add(id(edge))
+            if edge.source == edge.target:
+                loops += 1
+                continue
+            middle = _middle_of(edge, net)
+            if middle is None:
+                without += 1
+                continue
+            back = None
+            for other in waiting.get((edge.target, edge.source), ()):
+                if id(other) not in done and _same_road(edge, other):
+                    course = _middle_of(other, net)
+                    if (
+                        course is not None
+                        and course.shape == middle.shape
+                        and np.allclose(course[::-1], middle, atol=1e-6, equal_nan=True)
+                    ):
+                        back = other
+                        done.add(id(other))
+                        break
+            width = _positive(edge.properties.get("width")) or self.options.width
+            out.append(_New(middle, width / 2.0, edge, back))
+        self.context.drop("edges from a node to itself", loops, "a lanelet does not end at the border where it begins")
+        self.context.drop("edges without length", without, "a lanelet needs bounds along its way")
+        return out
+
+    def node_points(self, net: Net, used: set[int]) -> dict[int, int]:
+        """A point for each node of the network; node number -> its id in the file. Nodes of lanelets that are written
+        as they came need none unless a new lanelet begins there."""
+        out = {}
+        for k, node in enumerate(net.nodes):
+            said = own(node.properties, NAME)
+            stored = said.get("point")
+            level = self.levels.get(node.level, _Level())
+            if type(stored) is int and stored in level.nodes and self.points[level.nodes[stored]].tags.get(NODE):
+                new = level.nodes[stored]
+                if not _same(self.points[new].xyz, self.placed(node.x, node.y, node.z, self.points[new].local)):
+                    new = -1
+            elif k not in used and isinstance(said.get("points"), list):
+                continue
+            else:
+                new = -1
+            if new == -1:
+                tags = {"type": "node", NODE: node.id}
+                name = node.properties.get("name")
+                if isinstance(name, str) and name != node.id:
+                    tags["name"] = name
+                new = self.new_point(node.x, node.y, node.z or 0.0 if node.z is not None else math.nan, tags)
+            out[k] = new
+        return out
+
+    def placed(self, x: float, y: float, z: float | None, local: bool) -> tuple[float, float, float]:
+        """A place in metres in the coordinates that a point is anchored in."""
+        high = math.nan if z is None else z
+        if local or self.layers.frame is None:
+            return x, y, high
+        lon, lat = np.round(self.layers.frame.to_wgs84(np.array([[x, y]]))[0], 12).tolist()
+        return lon, lat, high
+
+    def new_point(self, x: float, y: float, z: float, tags: Mapping[str, str] = NOTHING) -> int:
+        new = self.fresh()
+        said = dict(tags)
+        if self.say_metres:
+            said |= {LOCAL[0]: number(x), LOCAL[1]: number(y)}
+        if not math.isnan(z):
+            said["ele"] = number(z)
+        self.points[new] = _Point((x, y, z), True, said, stored=False)
+        return new
+
+    def bounds(self, net: Net, new: Sequence[_New], centres: Mapping[int, int]) -> None:
+        """Bounds, centrelines and relations of the new lanelets."""
+        arms: dict[int, list[Arm]] = {}
+        for k, lane in enumerate(new):
+            for far, end in ((False, lane.edge.source), (True, lane.edge.target)):
+                a, b = (lane.middle[-1], lane.middle[-2]) if far else (lane.middle[0], lane.middle[1])
+                step = b[:2] - a[:2]
+                away = step / np.hypot(*step)
+                both = lane.back is not None
+                arm = Arm(k, far, (float(away[0]), float(away[1])), far or both, not far or both, lane.half)
+                arms.setdefault(end, []).append(arm)
+        borders: dict[int, Border] = {}
+        shared: dict[int, list[int]] = {}
+        joins: dict[tuple[int, bool], tuple[int, bool]] = {}
+        for node, there in sorted(arms.items()):
+            at = net.nodes[node]
+            stored = self.stored_border(net, node)
+            found = stored[0] if stored else _lanes.border((at.x, at.y), there)
+            if found is None:
+                continue
+            borders[node] = found
+            if stored:
+                shared[node] = list(stored[1])
+            joins |= {(arm.lane, arm.far): (node, found.along(arm)) for arm in there if found.shared_by(arm)}
+        narrow = 0
+        for k, lane in enumerate(new):
+            left, right, squeezed = self.sides(k, lane, joins, borders)
+            narrow += squeezed
+            sides = []
+            for side, points in enumerate((left, right)):
+                names = []
+                for n, (x, y) in enumerate(points.tolist()):
+                    join = joins.get((k, n > 0)) if n in (0, len(points) - 1) else None
+                    z = float(lane.middle[n, 2])
+                    if join is None:
+                        names.append(self.new_point(x, y, z))
+                        continue
+                    node, straight = join
+                    if node not in shared:
+                        found = borders[node]
+                        shared[node] = [self.new_point(*p, z) for p in (found.left, found.right)]
+                    names.append(shared[node][side if straight else 1 - side])
+                sides.append(names)
+            self.emit(net, lane, sides, centres)
+        if narrow:
+            self.context.warn(f"{narrow} lanes are narrower than their edges say, so that their bounds do not cross")
+        possible = sum(map(_lanes.ways, arms.values()))
+        made = 0
+        for node, there in arms.items():
+            across = [_lanes.across(arm, borders[node]) if (arm.lane, arm.far) in joins else 0.0 for arm in there]
+            made += _lanes.through(there, across)
+        if lost := possible - made:
+            self.context.warn(
+                f"{lost} of {possible} ways from one lane into the next are no connection in Lanelet2's sense: their "
+                "turns are too sharp for bounds to be shared"
+            )
+
+    def stored_border(self, net: Net, node: int) -> tuple[Border, tuple[int, int]] | None:
+        """The two points of a node of stored lanelets, in metres, where it is still there."""
+        at = net.nodes[node]
+        pair = integers(own(at.properties, NAME).get("points"))
+        level = self.levels.get(at.level)
+        if pair is None or len(pair) != 2 or level is None or any(at.id in moved for moved in self.moved.values()):
+            return None
+        names = [level.nodes.get(i, i) for i in pair]
+        if pair[0] == pair[1] or any(n not in self.points for n in names):
+            return None
+        left, right = (self.in_metres(self.points[n]) for n in names)
+        if left is None or right is None:
+            return None
+        x, y = left[0] - right[0], left[1] - right[1]
+        length = math.hypot(x, y)
+        return (Border((y / length, -x / length), left, right), (names[0], names[1])) if length > 1e-6 else None
+
+    def in_metres(self, point: _Point) -> tuple[float, float] | None:
+        if point.local:
+            return point.xyz[:2]
+        if self.layers.frame is None or math.isnan(point.xyz[0]):
+            return None
+        x, y = self.layers.frame.to_local(np.array([point.xyz[:2]]))[0].tolist()
+        return x, y
+
+    def sides(
+        self, k: int, lane: _New, joins: dict[tuple[int, bool], tuple[int, bool]], borders: Mapping[int, Border]
+    ) -> tuple[Array, Array, bool]:
+        """(left, right, whether they are closer than asked for). Ends that a border would spoil leave ``joins``."""
+        half = lane.half
+        if not shapely.LineString(lane.middle[:, :2]).is_simple:  # it crosses itself, however narrow it is
+            for far in (False, True):
+                joins.pop((k, far), None)
+            return *_lanes.beside(lane.middle[:, :2], half), False
+        for attempt in range(8):
+            left, right = _lanes.beside(lane.middle[:, :2], half)
+            for kept in ((False, True), (True,), (False,), ()):
+                a, b = left.copy(), right.copy()
+                for far in kept:
+                    if (k, far) in joins:
+                        node, straight = joins[k, far]
+                        found = borders[node]
+                        ends = (found.left, found.right) if straight else (found.right, found.left)
+                        a[-1 if far else 0], b[-1 if far else 0] = ends
+                if _lanes.is_sound(a, b):
+                    for far in {False, True} - set(kept):
+                        joins.pop((k, far), None)
+                    return a, b, attempt > 0
+            half /= 2.0
+        for far in (False, True):
+            joins.pop((k, far), None)
+        return *_lanes.beside(lane.middle[:, :2], half), True
+
+    def emit(self, net: Net, lane: _New, sides: Sequence[list[int]], centres: Mapping[int, int]) -> None:
+        edge = lane.edge
+        middle = [centres[edge.source]]
+        middle += [self.new_point(x, y, z) for x, y, z in lane.middle[1:-1].tolist()]
+        middle.append(centres[edge.target])
+        members = []
+        for role, refs in (("left", sides[0]), ("right", sides[1]), ("centerline", middle)):
+            new = self.fresh()
+            self.ways[new] = (refs, {"type": "virtual"}, NOTHING)
+            members.append(("way", new, role))
+        known = own(edge.properties, NAME).get("tags")
+        tags = {"type": "lanelet", "subtype": self.subtype(edge), "location": self.options.location}
+        stated = as_texts(known) if isinstance(known, Mapping) else NOTHING
+        tags |= {k: v for k, v in stated.items() if k != "one_way" and not k.startswith(("one_way:", "fleetmap:"))}
+        tags["one_way"] = "yes" if lane.back is None else "no"
+        for word in ("name", "speed_limit", "width"):
+            tags.pop(word, None)
+        name = edge.properties.get("name")
+        if isinstance(name, str) and name != edge.id:
+            tags["name"] = name
+        if (speed := _metres_per_second(edge.properties)) is not None:
+            tags["speed_limit"] = _kmh(speed)
+        if (width := _positive(edge.properties.get("width"))) is not None:
+            tags["width"] = repr(width)
+        tags |= {EDGE: edge.id, SOURCE: net.nodes[edge.source].id, TARGET: net.nodes[edge.target].id}
+        if lane.back is not None:
+            tags[BACK] = lane.back.id
+        self.relations[self.fresh()] = (members, tags, NOTHING)
+
+    def subtype(self, edge: Edge) -> str:
+        """What its source calls it, in Lanelet2's words."""
+        known = as_texts(own(edge.properties, NAME).get("tags")).get("subtype")
+        highway = as_texts(own(edge.properties, "osm").get("tags")).get("highway")
+        if known:
+            return known
+        return SUBTYPES.get(highway, "road") if highway else self.options.subtype
+
+    # --- XML ---
+
+    def text(self) -> str:
+        nodes = self.placed_nodes()
+        for what, times in sorted(self.lost.items()):
+            self.context.drop(what, times, "a Lanelet2 map has no place for them")
+        if self.layers.datum is not None:
+            self.context.drop("datum", 1, "a Lanelet2 map stands on earth and has no local frame of its own")
+        return _osm_text.document(self.head(), nodes, self.ways, self.relations)
+
+    def placed_nodes(self) -> dict[int, _osm_text.Node]:
+        """All points in degrees with their tags."""
+        todo = [i for i, p in self.points.items() if p.local and not (self.metric or math.isnan(p.xyz[0]))]
+        degrees: dict[int, tuple[float, float]] = {}
+        if todo and self.layers.frame is not None:
+            places = self.layers.frame.to_wgs84(np.array([self.points[i].xyz[:2] for i in todo], np.float64))
+            degrees = {i: (x, y) for i, (x, y) in zip(todo, places.tolist(), strict=True)}
+        out = {}
+        for i, point in self.points.items():
+            if not point.local:
+                lon, lat = point.xyz[:2]
+            else:
+                lon, lat = degrees.get(i) or point.at or (math.nan, math.nan)
+            out[i] = _osm_text.Node(lon, lat, self.tags(point), point.attributes)
+        return out
+
+    def tags(self, point: _Point) -> Mapping[str, str]:
+        """The tags as they were said, but for places that are no longer true."""
+        tags = point.tags
+        if not point.stored:
+            return tags
+        x, y, z = point.xyz
+        if point.local and not math.isnan(x) and (_decimal(tags.get(LOCAL[0])), _decimal(tags.get(LOCAL[1]))) != (x, y):
+            tags = {**tags, LOCAL[0]: number(x), LOCAL[1]: number(y)}
+        elif not point.local and LOCAL[0] in tags and (point.at is None or point.at != (x, y)):
+            tags = {k: v for k, v in tags.items() if k not in LOCAL}
+            self.lost["local_x and local_y of moved points"] += 1
+        said = _decimal(tags["ele"]) if "ele" in tags else 0.0
+        if not math.isnan(z) and z != said and not (math.isnan(said) and z == 0.0):
+            tags = {**tags, "ele": number(z)}
+        return tags
+
+    def head(self) -> list[str]:
+        root: dict[str, str] = {"version": "0.6", "generator": GENERATOR}
+        for one in self.documents:
+            root |= as_texts(one.get("attributes"))
+        root["version"] = "0.6"
+        if self.context.attribution and not root.keys() & {"attribution", "copyright", "license"}:
+            root["attribution"] = "; ".join(self.context.attribution)
+        lines = [f"<osm{attribute_text(root, frozenset())}>"]
+        for one in self.documents:
+            lines += _osm_text.further_elements(one.get("elements"))
+            boxes = one.get("bounds")
+            lines += [f" <bounds{attribute_text(as_texts(b), frozenset())}/>" for b in boxes or [] if as_texts(b)]
+        return lines
+
+
+def _all_tags(said: Mapping[str, Any]) -> Iterable[Any]:
+    """The tags of a stored point or of a way's bends."""
+    bends = said.get("vertices")
+    rows = bends if isinstance(bends, list) else [bends]
+    return [said.get("tags"), *(row.get("tags") for row in rows if isinstance(row, Mapping))]
+
+
+def _xyz(shape: Any) -> tuple[float, float, float]:
+    at = _course(shape)
+    return at[0] if at else (math.nan, math.nan, math.nan)
+
+
+def _course(shape: Any) -> list[tuple[float, float, float]]:
+    """The points of a line or ring, z NaN where it has none; nothing for any other geometry."""
+    if shape.geom_type not in ("LineString", "LinearRing", "Point") or shape.is_empty:
+        return []
+    return [(x, y, z) for x, y, z in shapely.get_coordinates(shape, include_z=True).tolist()]
+
+
+def _same(a: tuple[float, float, float], b: tuple[float, float, float]) -> bool:
+    """The same place; a line without elevations says nothing of them."""
+    high = math.isnan(a[2]) or math.isnan(b[2]) or a[2] == b[2]
+    return a[0] == b[0] and a[1] == b[1] and high
+
+
+def _pair(value: Any) -> tuple[float, float] | None:
+    if not isinstance(value, list | tuple) or len(value) != 2:
+        return None
+    good = all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+    return (float(value[0]), float(value[1])) if good else None
+
+
+def _members(said: Mapping[str, Any]) -> list[tuple[str, int, str]]:
+    rows = said.get("members")
+    return [
+        (str(row[0]), row[1], str(row[2]))
+        for row in (rows if isinstance(rows, list) else [])
+        if isinstance(row, list | tuple) and len(row) == 3 and type(row[1]) is int and abs(row[1]) < INT64
+    ]
+
+
+def _metres_per_second(properties: Properties) -> float | None:
+    value = properties.get("speed_limit")
+    good = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < 1e9
+    return float(value) if good and value is not None else None
+
+
+def _kmh(speed: float) -> str:
+    """As Autoware reads it: kilometres an hour without a unit."""
+    return _osm_text.plain(repr(round(speed * 3.6, 9) + 0.0)).removesuffix(".0")
+
+
+def _same_road(a: Edge, b: Edge) -> bool:
+    """Whether two edges, there and back, can be one lanelet."""
+    words = ("speed_limit", "width", "name")
+    return all(a.properties.get(w) == b.properties.get(w) for w in words) and a.level == b.level
+
+
+def _middle_of(edge: Edge, net: Net) -> Array | None:
+    """[k, 3] from node to node, metres, no point twice in a row; z NaN in two dimensions; None without a length."""
+    a, b = net.nodes[edge.source], net.nodes[edge.target]
+    inner = np.empty((0, 3))
+    if edge.geometry.geom_type == "LineString" and not edge.geometry.is_empty:
+        inner = shapely.get_coordinates(edge.geometry, include_z=True)[1:-1]
+    ends = np.array([[n.x, n.y, math.nan if n.z is None else n.z] for n in (a, b)])
+    line = np.vstack([ends[:1], inner, ends[1:]])
+    if not np.isnan(line[:, 2]).all():
+        line[:, 2] = np.where(np.isnan(line[:, 2]), 0.0, line[:, 2])
+    keep = np.ones(len(line), bool)
+    keep[1:] = np.hypot(*np.diff(line[:, :2], axis=0).T) > 1e-6
+    if not keep[-1]:  # the last point is the node: what stands on it goes
+        before = np.flatnonzero(keep)[-1]
+        keep[before], keep[-1] = before == 0, before != 0
+    line = line[keep]
+    return line if len(line) > 1 else None
+
+
+def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
+    """The networks, and what came from such a map."""
+    return [key for key in keys if key.layer == "topology" or (key.layer == "objects" and key.name == NAME)]
+
+
+register(
+    Format(
+        name=NAME,
+        title="Lanelet2 (also Autoware's)",
+        files=(MAIN,),
+        media_types=("application/vnd.openstreetmap.data+xml",),
+        carries=frozenset({"topology", "objects"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"topology"}),), anchor="wgs84", also=frozenset({"objects"}), own=True),
+        companions=companions,
+        write_options=WriteOptions,
+        family=NAME,
+        rank=36,
+        extensions=(".osm",),
+        choose=choose,
+    )
+)

@@ -1,0 +1,681 @@
+"""lanelet2: real maps come back whole, lanelets are a network, and networks from elsewhere become lanelets."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import subprocess
+from collections import Counter
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from lxml import etree
+
+from app import formats
+from app.bundle import Hints, Known
+from app.bundle import read as read_bundle
+from app.convert import offline
+from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
+from app.formats import Group, Limits, ReadContext, WriteContext, get_format
+from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, speed_of, two_way
+from app.model.features import Features, features
+from app.model.frame import Datum
+from app.model.layers import Layers, PartKey
+
+FORMAT = get_format("lanelet2")
+SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "lanelet2"
+FACTS: dict[str, Any] = json.loads((SAMPLES / "facts.json").read_text())
+JUNCTION = (SAMPLES / "junction.osm").read_bytes()
+AUTOWARE = {p.name: p.read_bytes() for p in (SAMPLES / "local").iterdir()}
+NETWORK = PartKey("topology", "ground", "network")
+OBJECTS = PartKey("objects", "ground", "lanelet2")
+HERE = Datum(53.2686, -0.5245, heading=20.0)
+
+
+def read(files: bytes | dict[str, bytes], **context: Any) -> tuple[Layers, ReadContext]:
+    said = {"map.osm": files} if isinstance(files, bytes) else files
+    main = next(n for n in said if n.endswith(".osm"))
+    told = ReadContext(main=main, **context)
+    return formats.read(Group(FORMAT, main, said), told), told
+
+
+def write(layers: Layers, **context: Any) -> tuple[dict[str, bytes], WriteContext]:
+    told = WriteContext(**context)
+    return formats.write(FORMAT, layers, told), told
+
+
+def edited(layers: Layers, key: PartKey, change: Callable[[str, dict[str, Any]], dict[str, Any] | None]) -> Layers:
+    """The layers with other properties of one part's items; None takes an item out."""
+    part = layers.parts[key]
+    assert isinstance(part, Features)
+    said = [change(i, dict(p)) for i, p in zip(part.ids, part.properties, strict=True)]
+    keep = [k for k, p in enumerate(said) if p is not None]
+    left = part.take(keep)
+    new = Features(left.ids, left.geometry, tuple(p for p in said if p is not None), left.local, left.document)
+    return Layers({**layers.parts, key: new}, layers.datum, layers.levels)
+
+
+def part(layers: Layers, key: PartKey = NETWORK) -> Features:
+    found = layers.parts[key]
+    assert isinstance(found, Features)
+    return found
+
+
+def items(layers: Layers) -> dict[str, tuple[dict[str, Any], Any]]:
+    net = part(layers)
+    return {i: (dict(p), g) for i, p, g in zip(net.ids, net.properties, net.geometry, strict=True)}
+
+
+# --- a comparator of our own: it reads the XML and nothing else ----------------------------------------------------
+
+
+def elements(data: bytes) -> dict[tuple[str, int], dict[str, Any]]:
+    """Each element by type and id: attributes as values, tags, nodes and members in order."""
+    out: dict[tuple[str, int], dict[str, Any]] = {}
+    for e in etree.fromstring(data):
+        if e.tag not in ("node", "way", "relation"):
+            continue
+        attributes = {k: v for k, v in e.attrib.items() if k != "id" and v != ""}
+        place = tuple(float(attributes.pop(k)) if k in attributes else None for k in ("lat", "lon"))
+        out[e.tag, int(e.get("id"))] = {
+            "place": place,
+            "attributes": attributes,
+            "tags": {t.get("k"): t.get("v") for t in e.iter("tag")},
+            "refs": [int(n.get("ref")) for n in e.iter("nd")],
+            "members": [(m.get("type"), int(m.get("ref")), m.get("role")) for m in e.iter("member")],
+        }
+    return out
+
+
+def further(data: bytes) -> list[tuple[str, dict[str, str]]]:
+    root = etree.fromstring(data)
+    known = {k: v for k, v in root.attrib.items() if k != "version"}
+    others = [(e.tag, dict(e.attrib)) for e in root if e.tag not in ("node", "way", "relation")]
+    return [("osm", known), *others]
+
+
+def assert_same(a: bytes, b: bytes) -> None:
+    one, two = elements(a), elements(b)
+    assert one.keys() == two.keys()
+    for key in one:
+        assert one[key] == two[key], key
+    assert further(a) == further(b)
+
+
+def test_the_comparator_sees_what_matters() -> None:
+    for old, new in [
+        (b"lat='0.00005'", b"lat='0.00006'"),
+        (b"k='one_way' v='yes'", b"k='one_way' v='no'"),
+        (b"role='ref_line'", b"role='refers'"),
+        (b"<nd ref='3' />\n    <nd ref='2' />", b"<nd ref='2' />\n    <nd ref='3' />"),
+        (b"version='2'", b"version='3'"),
+        (b"generator='JOSM'", b"generator='josm'"),
+    ]:
+        assert old in JUNCTION
+        with pytest.raises(AssertionError):
+            assert_same(JUNCTION, JUNCTION.replace(old, new, 1))
+
+
+# --- real maps -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["fzi_mapping_example/mapping_example.osm", "autoware_mgrs_mini/lanelet2_map.osm"])
+def test_real_maps_come_back_whole(shared: Path, facts_json: dict[str, Any], name: str) -> None:
+    path = shared / "data" / "lanelet2" / name
+    files = {p.name: p.read_bytes() for p in path.parent.iterdir()}
+    back = offline(files, "lanelet2").files
+    assert_same(files[path.name], back[MAIN])
+    assert back.get(PROJECTOR) == files.get(PROJECTOR)
+    facts = facts_json[f"lanelet2/{name}"]["facts"]
+    layers, told = read(files)
+    assert not told.warnings
+    objects = part(layers, OBJECTS)
+    kinds = Counter(p["kind"] for p in objects.properties)
+    assert kinds["lanelet"] == facts["lanelets"]
+    assert kinds["area"] == facts["relations_by_type"].get("multipolygon", 0)
+    assert kinds["regulatory_element"] == facts["relations_by_type"].get("regulatory_element", 0)
+    ways = Counter(p["lanelet2"]["tags"].get("type", "None") for p in objects.properties if "refs" in p["lanelet2"])
+    assert ways == facts["ways_by_type"]
+    edges = [p for p in part(layers).properties if p["kind"] == "edge"]
+    lanelets = {p["lanelet2"]["lanelet"]: p["lanelet2"]["tags"]["subtype"] for p in edges}
+    assert Counter(lanelets.values()) == facts["lanelet_subtypes"]
+    west, south, east, north = (facts["node_bbox"][k] for k in ("minlon", "minlat", "maxlon", "maxlat"))
+    box = shapely.total_bounds(part(layers).geometry)
+    assert (box[:2] >= [west, south]).all()
+    assert (box[2:] <= [east, north]).all()
+
+
+def test_real_lanelets_are_two_way_where_they_say_so(shared: Path) -> None:
+    data = (shared / "data/lanelet2/fzi_mapping_example/mapping_example.osm").read_bytes()
+    stated = {
+        i: e["tags"] for (kind, i), e in elements(data).items() if kind == "relation" and e["tags"]["type"] == "lanelet"
+    }
+    layers, _ = read(data)
+    times = Counter(p["lanelet2"]["lanelet"] for p in part(layers).properties if p["kind"] == "edge")
+    for i, tags in stated.items():
+        assert times[i] == (2 if tags.get("one_way") in ("no", "false") else 1), tags
+
+
+def test_real_lanelets_follow_each_other_as_lanelet2_means_it(shared: Path) -> None:
+    """Worked out a second time, one lanelet after the other, from the XML alone."""
+    data = (shared / "data/lanelet2/fzi_mapping_example/mapping_example.osm").read_bytes()
+    found = elements(data)
+    rad = math.radians(49.0)
+    place = {i: (e["place"][1] * math.cos(rad), e["place"][0]) for (kind, i), e in found.items() if kind == "node"}
+
+    def side(line: list[int], at: tuple[float, float]) -> float:
+        points = [place[r] for r in line]
+        best, sign = math.inf, 0.0
+        for (ax, ay), (bx, by) in pairwise(points):
+            dx, dy = bx - ax, by - ay
+            t = max(0.0, min(1.0, ((at[0] - ax) * dx + (at[1] - ay) * dy) / (dx * dx + dy * dy)))
+            away = math.hypot(at[0] - ax - t * dx, at[1] - ay - t * dy)
+            if away < best:
+                best, sign = away, dx * (at[1] - ay) - dy * (at[0] - ax)
+        return sign
+
+    def middle(line: list[int]) -> tuple[float, float]:
+        a, b = place[line[0]], place[line[-1]]
+        return place[line[len(line) // 2]] if len(line) > 2 else ((a[0] + b[0]) / 2, (a[1] + b[1]) / 2)
+
+    starts: dict[str, tuple[int, int]] = {}
+    ends: dict[str, tuple[int, int]] = {}
+    for (kind, i), e in found.items():
+        if kind != "relation" or e["tags"]["type"] != "lanelet":
+            continue
+        left, right = (
+            next(found["way", r]["refs"] for _, r, role in e["members"] if role == w) for w in ("left", "right")
+        )
+        left = left[::-1] if side(left, middle(right)) >= 0 else left
+        right = right[::-1] if side(right, middle(left)) <= 0 else right
+        starts[f"l{i}"], ends[f"l{i}"] = (left[0], right[0]), (left[-1], right[-1])
+        if e["tags"].get("one_way") in ("no", "false"):
+            starts[f"l{i}:back"], ends[f"l{i}:back"] = (right[-1], left[-1]), (right[0], left[0])
+    layers, _ = read(data)
+    edges = {i: p for i, (p, _) in items(layers).items() if p["kind"] == "edge"}
+    assert edges.keys() == starts.keys()
+    follow = {(a, b) for a in edges for b in edges if ends[a] == starts[b]}
+    ours = {(a, b) for a in edges for b in edges if edges[a]["target"] == edges[b]["source"]}
+    assert follow <= ours, "nobody who may go on is kept from it"
+    # Beyond Lanelet2's own rule: where a lane for both ways ends, one may turn.
+    turning = {p[w] for i, p in edges.items() if i.endswith(":back") for w in ("source", "target")}
+    assert {edges[a]["target"] for a, _ in ours - follow} <= turning
+
+
+# --- our own samples, with facts worked out by hand ----------------------------------------------------------------
+
+
+def test_facts_of_a_junction() -> None:
+    layers, told = read(JUNCTION)
+    facts = FACTS["junction.osm"]
+    found = items(layers)
+    assert found.keys() == facts["nodes"].keys() | facts["edges"].keys()
+    for i, place in facts["nodes"].items():
+        p, g = found[i]
+        assert p["kind"] == "node"
+        np.testing.assert_allclose(shapely.get_coordinates(g, include_z=len(place) > 2)[0], place, atol=1e-12)
+        assert g.has_z == (len(place) > 2)
+    for i, (source, target, width, speed) in facts["edges"].items():
+        p, g = found[i]
+        assert (p["source"], p["target"]) == (source, target)
+        assert p["width"] == pytest.approx(width, abs=1e-3)
+        assert p.get("speed_limit") == speed
+        ends = [facts["nodes"][n][:2] for n in (source, target)]
+        np.testing.assert_allclose(shapely.get_coordinates(g)[[0, -1]], ends, atol=1e-12)
+    assert found["l102"][0]["name"] == "Short Street"
+    assert found["l103"][0]["lanelet2"]["tags"]["subtype"] == "crosswalk"
+    assert [w.where for w in told.warnings] == ["relation 106"], "the deleted lanelet is no road"
+    objects = dict(zip(part(layers, OBJECTS).ids, part(layers, OBJECTS).properties, strict=True))
+    assert objects["r105"]["kind"] == "area"
+    assert objects["w29"]["kind"] == "wall"
+    assert objects["w30"]["name"] == 'Höfe <2> & "3"'
+    assert objects["n11"]["kind"] == "start"
+    assert {i for i in objects if i.startswith("n")} == {"n11", "n50"}, "mere bends are no objects"
+    assert_same(JUNCTION, offline({"a.osm": JUNCTION}, "lanelet2").files[MAIN])
+
+
+def test_facts_of_a_map_in_metres() -> None:
+    layers, told = read(AUTOWARE)
+    assert not told.warnings
+    facts = FACTS["local"]
+    net = part(layers)
+    assert net.local.all(), "the projector is Local, so metres count"
+    found = items(layers)
+    assert found.keys() == {*facts["nodes"], "l8", "l8:back"}
+    for i, place in facts["nodes"].items():
+        np.testing.assert_allclose(shapely.get_coordinates(found[i][1], include_z=True)[0], place, atol=1e-9)
+    p, g = found["l8"]
+    np.testing.assert_allclose(shapely.get_coordinates(g, include_z=True)[1], facts["bend"], atol=1e-6)
+    assert (p["width"], p["speed_limit"]) == (facts["width"], facts["speed_limit"])
+    back = offline(AUTOWARE, "lanelet2").files
+    assert_same(AUTOWARE["lanelet2_map.osm"], back[MAIN])
+    assert back[PROJECTOR] == AUTOWARE[PROJECTOR]
+    alone, _ = read(AUTOWARE["lanelet2_map.osm"])
+    assert part(alone).local.all(), "and without that file, since no point stands on earth"
+
+
+def test_metres_of_another_frame_are_not_ours() -> None:
+    """An MGRS map stands on earth; its local_x and local_y go with it while its points stay where they are."""
+    node = "<node id='{}' lat='{}' lon='{}'><tag k='local_x' v='{}'/><tag k='local_y' v='5'/></node>"
+    at = [(1, 0.0001, 0.0, 7), (2, 0.0001, 0.0001, 8), (3, 0.0, 0.0, 9), (4, 0.0, 0.0001, 10)]
+    body = "".join(node.format(*row) for row in at) + (
+        "<way id='5'><nd ref='1'/><nd ref='2'/></way><way id='6'><nd ref='3'/><nd ref='4'/></way><relation id='7'>"
+        "<member type='way' ref='5' role='left'/><member type='way' ref='6' role='right'/>"
+        "<tag k='type' v='lanelet'/></relation>"
+    )
+    data = f"<osm version='0.6'>{body}</osm>".encode()
+    layers, _ = read({"map.osm": data, PROJECTOR: b"projector_type: MGRS\nmgrs_grid: 54SUE\n"})
+    assert not part(layers).local.any()
+    files, told = write(layers, options=WriteOptions())
+    assert_same(data, files[MAIN].replace(b' generator="Fleet Map Server"', b""))
+    assert not told.dropped
+    objects = part(layers, OBJECTS)
+    moved = objects.geometry.copy()
+    k = objects.ids.index("w5")
+    moved[k] = shapely.LineString([(0.0, 0.0001), (0.0001, 0.00012)])
+    other = Features(objects.ids, moved, objects.properties, objects.local.copy(), objects.document)
+    files, told = write(Layers({OBJECTS: other}), options=WriteOptions())
+    tags = elements(files[MAIN])["node", 2]["tags"]
+    assert tags == {}, "metres that are no longer true are left out"
+    assert elements(files[MAIN])["node", 1]["tags"] == {"local_x": "7", "local_y": "5"}
+    assert told.dropped == [
+        {"what": "local_x and local_y of moved points", "count": 1, "why": "a Lanelet2 map has no place for them"}
+    ]
+
+
+# --- what is detected ----------------------------------------------------------------------------------------------
+
+
+def test_plain_osm_stays_osm(shared: Path) -> None:
+    quarter = (SAMPLES.parent / "osm" / "quarter.osm").read_bytes()
+    assert not detect("a.osm", quarter)
+    for path in sorted((shared / "data/osm").rglob("*.osm")) + sorted((shared / "data/osm").rglob("osm.xml")):
+        assert not detect(path.name, path.read_bytes()), path
+    known = formats.detect("a.osm", quarter)
+    assert known is not None
+    assert known.name == "osm"
+    near = quarter.replace(b"</osm>", b'<way id="1"><tag k="name" v="lanelet"/></way></osm>')
+    assert near != quarter
+    assert not detect("a.osm", near)
+
+
+def test_lanelets_are_detected_whatever_the_quotes() -> None:
+    for data in (JUNCTION, JUNCTION.replace(b"k='type' v='lanelet'", b'v = "lanelet"\n k = "type"')):
+        known = formats.detect("map.osm", data)
+        assert known is not None
+        assert known.name == "lanelet2"
+    assert not detect("a.kml", b"<kml><tag k='type' v='lanelet'/></kml>")
+
+
+# --- words ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "speed"),
+    [
+        ("36", 10.0),
+        ("36 km/h", 10.0),
+        ("36kmh", 10.0),
+        ("10 m/s", 10.0),
+        ("10 mps", 10.0),
+        ("10 mph", 4.4704),
+        ("0", 0.0),
+        ("fast", None),
+        ("10 knots", None),
+        ("-5", None),
+        ("nan", None),
+        ("", None),
+        (None, None),
+    ],
+)
+def test_speeds(text: str | None, speed: float | None) -> None:
+    assert speed_of(text) == (None if speed is None else pytest.approx(speed, abs=1e-9))
+
+
+@pytest.mark.parametrize(
+    ("tags", "both"),
+    [
+        ({}, False),
+        ({"subtype": "road"}, False),
+        ({"subtype": "walkway"}, True),
+        ({"subtype": "crosswalk", "one_way": "yes"}, False),
+        ({"subtype": "road", "one_way": "no"}, True),
+        ({"subtype": "road", "one_way": "false"}, True),
+        ({"subtype": "road", "one_way:bicycle": "no"}, False),
+        ({"subtype": "road", "participant:bicycle": "yes", "one_way:bicycle": "no"}, True),
+        ({"subtype": "road", "participant:pedestrian": "yes"}, True),
+        ({"subtype": "walkway", "participant:vehicle": "yes", "participant:pedestrian": "yes"}, False),
+        ({"subtype": "stairs", "one_way:pedestrian": "yes"}, False),
+        ({"subtype": "shared_walkway"}, False),
+    ],
+)
+def test_which_lanelets_go_both_ways(tags: dict[str, str], both: bool) -> None:
+    assert two_way(tags) is both
+
+
+# --- edits ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_speed_of_the_network_reaches_the_lanelet() -> None:
+    layers, _ = read(JUNCTION)
+    new = edited(layers, NETWORK, lambda i, p: {**p, "speed_limit": 0.55, "name": "A"} if i == "l101" else p)
+    files, _ = write(new)
+    tags = elements(files[MAIN])["relation", 101]["tags"]
+    assert (tags["speed_limit"], tags["name"]) == ("1.98", "A")
+    again, _ = read(files[MAIN])
+    assert items(again)["l101"][0]["speed_limit"] == 0.55
+
+
+@pytest.mark.parametrize(("gone", "turned"), [("l103:back", False), ("l103", True)])
+def test_a_direction_that_is_gone_makes_the_lanelet_one_way(gone: str, turned: bool) -> None:
+    layers, _ = read(JUNCTION)
+    files, told = write(edited(layers, NETWORK, lambda i, p: None if i == gone else p))
+    lanelet = elements(files[MAIN])["relation", 103]
+    assert lanelet["tags"]["one_way"] == "yes"
+    assert lanelet["members"] == [
+        ("way", 25, "right" if turned else "left"),
+        ("way", 26, "left" if turned else "right"),
+    ]
+    again, _ = read(files[MAIN])
+    left = items(layers).keys() - {gone}
+    ends = {(p["source"], p["target"]) for i, (p, _) in items(layers).items() if i in left and p["kind"] == "edge"}
+    place = {i: g.coords[0][:2] for i, (p, g) in items(layers).items() if p["kind"] == "node"}
+    now = {i: g.coords[0][:2] for i, (p, g) in items(again).items() if p["kind"] == "node"}
+    there = {(now[p["source"]], now[p["target"]]) for p, _ in items(again).values() if p["kind"] == "edge"}
+    assert there == {(place[a], place[b]) for a, b in ends}
+    assert not told.warnings
+
+
+def test_a_lanelet_without_edges_goes_and_its_bounds_stay() -> None:
+    layers, _ = read(JUNCTION)
+    files, told = write(edited(layers, NETWORK, lambda i, p: None if i == "l102" else p))
+    found = elements(files[MAIN])
+    assert ("relation", 102) not in found
+    assert {("way", 23), ("way", 24)} <= found.keys()
+    why = "a Lanelet2 map has no place for them"
+    assert told.dropped == [{"what": "lanelets whose edges are no longer in the network", "count": 1, "why": why}]
+
+
+def test_a_new_edge_joins_the_lanelets_that_are_there() -> None:
+    layers, _ = read(JUNCTION)
+    net = part(layers)
+    line = shapely.LineString([(0.0002, 0.000015, 3.0), (0.0003, 0.000015, 3.0)])
+    rows = [(f.id, f.geometry, f.properties) for f in net]
+    rows += [("end", shapely.Point(0.0003, 0.000015, 3.0), {"kind": "node", "name": "Gate"})]
+    rows += [("more", line, {"kind": "edge", "source": "n3:13", "target": "end", "width": 3.0})]
+    new = Layers({**layers.parts, NETWORK: features(rows, "wgs84")}, Datum(0.0, 0.0))
+    files, told = write(new)
+    found = elements(files[MAIN])
+    before = elements(JUNCTION)
+    assert all(found[key] == before[key] for key in before), "what was there stays as it was"
+    lanelet = next(
+        e for (kind, i), e in found.items() if kind == "relation" and e["tags"].get("fleetmap:edge") == "more"
+    )
+    sides = {role: found["way", i]["refs"] for _, i, role in lanelet["members"]}
+    assert (sides["left"][0], sides["right"][0]) == (3, 13), "its bounds begin where those of the one before end"
+    again, _ = read(files[MAIN])
+    ids = items(again)
+    assert {"more", "end"} <= ids.keys()
+    assert ids["end"][0]["name"] == "Gate"
+    assert ids["more"][0]["width"] == 3.0
+    assert not told.warnings
+
+
+# --- networks from elsewhere ---------------------------------------------------------------------------------------
+
+
+def net(edges: list[tuple[str, str]], places: dict[str, tuple[float, ...]], **said: Any) -> Features:
+    rows: list[tuple[str, Any, dict[str, Any]]] = []
+    rows += [(i, shapely.Point(*at), {"kind": "node", "name": i}) for i, at in places.items()]
+    for a, b in edges:
+        line = shapely.LineString([places[a], places[b]])
+        rows.append((f"{a}_{b}", line, {"kind": "edge", "source": a, "target": b, **said}))
+    return features(rows, "local")
+
+
+def lanelets(data: bytes) -> dict[str, tuple[dict[str, str], dict[str, list[int]], dict[int, tuple[float, float]]]]:
+    """By edge: tags, refs by role, and the metres that each point says."""
+    found = elements(data)
+    metres = {
+        i: (float(e["tags"]["local_x"]), float(e["tags"]["local_y"]))
+        for (kind, i), e in found.items()
+        if kind == "node"
+    }
+    return {
+        e["tags"]["fleetmap:edge"]: (e["tags"], {r: found["way", i]["refs"] for _, i, r in e["members"]}, metres)
+        for (kind, _), e in found.items()
+        if kind == "relation"
+    }
+
+
+def valid(data: bytes) -> None:
+    """Lanelet2's rules: bounds of two and more points, the left one on the left, neither crossing."""
+    for name, (tags, sides, at) in lanelets(data).items():
+        left, right = ([at[r] for r in sides[w]] for w in ("left", "right"))
+        assert min(len(left), len(right)) > 1
+        assert shapely.LinearRing([*left, *right[::-1]]).is_simple, name
+        assert shapely.Polygon([*right, *left[::-1]]).exterior.is_ccw, f"{name}: the left bound is not on the left"
+        assert tags["one_way"] in ("yes", "no")
+
+
+def test_a_straight_road_is_worked_out_by_hand() -> None:
+    places = {"a": (0.0, 0.0), "b": (10.0, 0.0), "c": (20.0, 10.0)}
+    two = net([("a", "b"), ("b", "a"), ("b", "c")], places, width=2.0, speed_limit=1.5)
+    files, told = write(Layers({NETWORK: two}, HERE))
+    assert list(files) == [MAIN]
+    found = lanelets(files[MAIN])
+    assert found.keys() == {"a_b", "b_c"}
+    tags, sides, at = found["a_b"]
+    assert (tags["one_way"], tags["fleetmap:back"], tags["speed_limit"], tags["subtype"]) == (
+        "no",
+        "b_a",
+        "5.4",
+        "road",
+    )
+    assert found["b_c"][0]["one_way"] == "yes"
+    # At b the border stands on the bisector: tan(22.5°) = 0.414214 back on the left, as far ahead on the right.
+    corner = math.tan(math.radians(22.5))
+    np.testing.assert_allclose([at[r] for r in sides["left"]], [(0, 1), (10 - corner, 1)], atol=1e-6)
+    np.testing.assert_allclose([at[r] for r in sides["right"]], [(0, -1), (10 + corner, -1)], atol=1e-6)
+    assert sides["left"][-1] == found["b_c"][1]["left"][0], "lanelets that follow each other share their points"
+    assert sides["right"][-1] == found["b_c"][1]["right"][0]
+    valid(files[MAIN])
+    frame = Layers({}, HERE).frame
+    assert frame is not None
+    for (kind, i), e in elements(files[MAIN]).items():
+        if kind == "node":
+            lat, lon = e["place"]
+            np.testing.assert_allclose(frame.to_local(np.array([[lon, lat]]))[0], at[i], atol=1e-6)
+    assert not told.warnings
+    assert {f["what"] for f in told.template} == {"type of bounds", "location of lanelets", "subtype of lanelets"}
+
+
+@pytest.mark.parametrize("arms", [3, 4, 5, 6])
+def test_a_crossing_connects_what_it_can_and_says_what_not(arms: int) -> None:
+    places = {"m": (0.0, 0.0)}
+    for k in range(arms):
+        places[f"p{k}"] = (20 * math.cos(k * math.tau / arms), 20 * math.sin(k * math.tau / arms))
+    edges = [pair for k in range(arms) for pair in (("m", f"p{k}"), (f"p{k}", "m"))]
+    files, told = write(Layers({NETWORK: net(edges, places)}, HERE))
+    valid(files[MAIN])
+    assert files == write(Layers({NETWORK: net(edges, places)}, HERE))[0]
+    ends = []
+    for tags, sides, _ in lanelets(files[MAIN]).values():
+        far = tags["fleetmap:target"] == "m"
+        k = -1 if far else 0
+        pair = (sides["left"][k], sides["right"][k])
+        ends.append(pair if far else pair[::-1])  # looking towards the crossing
+    connected = sum(a == b[::-1] for a in ends for b in ends)
+    said = next(w.problem for w in told.warnings)
+    possible = arms * (arms - 1)
+    assert said.startswith(f"{possible - connected} of {possible} ways")
+    assert connected >= possible / 2
+    again, _ = read(files[MAIN])
+    assert {(p["source"], p["target"]) for p, _ in items(again).values() if p["kind"] == "edge"} == set(edges)
+
+
+@pytest.mark.parametrize("to", ["tmap2", "osm"])
+def test_real_networks_become_valid_lanelets_and_come_back(shared: Path, tmp_path: Path, to: str) -> None:
+    farm = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/topological"
+    name = {
+        "tmap2": f"{farm}/network.tmap2.yaml",
+        "osm": "osm/urban-usa-mn-minnesota-zoo/osm.xml",
+    }[to]
+    path = shared / "data" / name
+    files = {path.name: path.read_bytes()}
+    datum = Datum(53.268642038, -0.524509505881) if to == "tmap2" else Datum(44.7644, -93.2073)
+    made = offline(files, "lanelet2", datum=datum)
+    valid(made.files[MAIN])
+    before = read_bundle(files, Hints(), Known(datum), Limits()).layers(datum)
+    after = read_bundle(made.files, Hints(), Known(datum), Limits()).layers(datum)
+    one, two = part(before), part(after)
+    places = dict(zip(two.ids, two.in_local(after.frame), strict=True))
+    assert set(one.ids) == set(two.ids)
+    for i, p, g in zip(one.ids, one.properties, one.in_local(before.frame), strict=True):
+        q = two.properties[two.index()[i]] if len(one) < 1000 else None
+        assert shapely.hausdorff_distance(g, places[i]) < 1e-6
+        if q is not None:
+            assert [p.get(w) for w in ("kind", "source", "target", "width")] == [
+                q.get(w) for w in ("kind", "source", "target", "width")
+            ]
+    assert offline(made.files, "lanelet2", datum=datum).files == made.files
+    if shutil.which("osmium"):
+        (tmp_path / MAIN).write_bytes(made.files[MAIN])
+        said = subprocess.run(
+            ["osmium", "fileinfo", "-e", "-j", str(tmp_path / MAIN)], capture_output=True, check=True, timeout=60
+        )
+        data = json.loads(said.stdout)["data"]
+        assert data["objects_ordered"]
+        assert data["count"]["relations"] == len(lanelets(made.files[MAIN]))
+
+
+@pytest.mark.skipif(not shutil.which("osmium"), reason="osmium is not installed")
+def test_osmium_reads_what_is_written(shared: Path, facts_json: dict[str, Any], tmp_path: Path) -> None:
+    name = "lanelet2/fzi_mapping_example/mapping_example.osm"
+    made = offline({"a.osm": (shared / "data" / name).read_bytes()}, "lanelet2").files[MAIN]
+    (tmp_path / MAIN).write_bytes(made)
+    said = subprocess.run(
+        ["osmium", "fileinfo", "-e", "-j", str(tmp_path / MAIN)], capture_output=True, check=True, timeout=60
+    )
+    data = json.loads(said.stdout)["data"]
+    facts = facts_json[name]["facts"]["osmium"]
+    assert {k: data["count"][k] for k in ("nodes", "ways", "relations")} == {
+        k: facts[k] for k in ("nodes", "ways", "relations")
+    }
+    assert data["bbox"] == facts["bbox"]
+    assert data["objects_ordered"]
+
+
+def test_options_are_heeded() -> None:
+    one = net([("a", "b")], {"a": (0.0, 0.0, 1.0), "b": (10.0, 0.0, 2.0)})
+    options = WriteOptions(width=3.0, subtype="walkway", location="nonurban", projector_info=True)
+    files, told = write(Layers({NETWORK: one}, HERE), options=options)
+    tags, sides, at = lanelets(files[MAIN])["a_b"]
+    assert (tags["subtype"], tags["location"], "width" in tags) == ("walkway", "nonurban", False)
+    assert {at[r][1] for r in sides["left"]} == {1.5}
+    assert files[PROJECTOR].startswith(b"projector_type: Local")
+    assert {"what": "width of lanes", "value": 3.0, "why": "1 edges say none"} in told.template
+    assert [elements(files[MAIN])["node", r]["tags"]["ele"] for r in sides["right"]] == ["1.0", "2.0"]
+    layers, _ = read(files)
+    assert part(layers).local.all()
+    assert "width" not in items(layers)["a_b"][0], "what was filled in is no information"
+
+
+def test_sharp_bends_and_narrow_places_stay_sound() -> None:
+    points = [(0, 0), (4, 0), (4.2, 0.3), (0, 0.6), (0, 5)]
+    line = shapely.LineString(points)
+    rows: list[tuple[str, Any, dict[str, Any]]] = [
+        ("a", shapely.Point(0, 0), {"kind": "node"}),
+        ("b", shapely.Point(0, 5), {"kind": "node"}),
+        ("e", line, {"kind": "edge", "source": "a", "target": "b", "width": 4.0}),
+        (
+            "loop",
+            shapely.LineString([(0, 0), (-9, 0), (-9, 9), (0, 0)]),
+            {"kind": "edge", "source": "a", "target": "a"},
+        ),
+        ("c", shapely.Point(0, 5), {"kind": "node"}),
+        ("nothing", shapely.LineString([(0, 5), (0, 5)]), {"kind": "edge", "source": "b", "target": "c"}),
+    ]
+    files, told = write(Layers({NETWORK: features(rows, "local")}, HERE))
+    valid(files[MAIN])
+    assert lanelets(files[MAIN]).keys() == {"e"}
+    assert any("narrower" in w.problem for w in told.warnings)
+    assert {"edges without length", "edges from a node to itself"} <= {d["what"] for d in told.dropped}
+
+
+def test_without_a_datum_it_says_what_to_supply() -> None:
+    one = net([("a", "b")], {"a": (0.0, 0.0), "b": (10.0, 0.0)})
+    with pytest.raises(MissingDatum, match="datum"):
+        write(Layers({NETWORK: one}))
+
+
+# --- bad input -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (b"lat='0.00003' lon='0.0'", b"lat='91' lon='0.0'", "no place on earth"),
+        (b"<nd ref='1' />", b"<nd ref='x' />", "whole number"),
+        (b"<osm ", b"<!DOCTYPE osm><osm ", "DOCTYPE"),
+        (b"lon='0.0002'", b"lon='170'", "too far|too much"),
+    ],
+)
+def test_bad_files_are_refused_with_the_reason(old: bytes, new: bytes, said: str) -> None:
+    assert old in JUNCTION
+    with pytest.raises(BadUpload, match=said) as caught:
+        read(JUNCTION.replace(old, new, 1))
+    assert caught.value.problems[0].file == "map.osm"
+
+
+def test_limits_hold() -> None:
+    with pytest.raises(TooLarge):
+        read(JUNCTION, limits=Limits(features=20))
+    with pytest.raises(TooLarge):
+        read({**AUTOWARE, PROJECTOR: b"#" * 70_000})
+    with pytest.raises(UnreadableFile) as caught:
+        read({**AUTOWARE, PROJECTOR: b"projector_type: [Local"})
+    assert caught.value.problems[0].file == PROJECTOR
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"<nd ref='3' />\n    <nd ref='2' />", b"<nd ref='777' />\n    <nd ref='2' />"),
+        (b"ref='24' role='right'", b"ref='24' role='left'"),
+        (b"ref='24' role='right'", b"ref='2400' role='right'"),
+        (b"<member type='way' ref='23' role='left' />", b""),
+    ],
+)
+def test_broken_lanelets_are_kept_and_told(old: bytes, new: bytes) -> None:
+    data = JUNCTION.replace(old, new, 1)
+    assert data != JUNCTION
+    layers, told = read(data)
+    assert "l102" not in items(layers)
+    assert any(w.where == "relation 102" for w in told.warnings)
+    files, _ = write(layers)
+    assert_same(data, files[MAIN])
+
+
+def test_odd_values_of_stored_words_do_no_harm() -> None:
+    layers, _ = read(JUNCTION)
+    odd: list[Any] = [
+        None,
+        5,
+        "x",
+        [1, "a"],
+        {"refs": "x"},
+        {"refs": [1, 2], "vertices": 3, "missing": "q"},
+        {"members": [1]},
+    ]
+    for value in odd:
+        for key in (OBJECTS, NETWORK):
+            changed = edited(layers, key, lambda i, p, value=value: {**p, "lanelet2": value})  # type: ignore[misc]
+            files, _ = write(Layers(changed.parts, Datum(0.0, 0.0)))
+            etree.fromstring(files[MAIN])
