@@ -5,6 +5,8 @@ where x ≤ free_thresh (free wins), else unknown; ``scale``: between the thresh
 free)); ``raw``: g itself up to 100, else unknown. A pixel that is not opaque is unknown (trinary, scale). The picture's
 top row is the map's last one. Comparisons are in float32. Source: nav2_map_server, map_io.cpp.
 
+A costmap filter mask (keepout, speed) is such a grid with one more file, ``<grid>_filter_info.yaml``: see ``_masks``.
+
 Frame: local; ``origin`` = [x, y, yaw] of the lower left corner, metres and radians. Nav2 ignores the yaw.
 """
 
@@ -30,6 +32,7 @@ from app.formats import (
     ReadContext,
     WriteContext,
     _image,
+    _masks,
     _occupancy_grid_rules,
     _yaml,
     register,
@@ -123,13 +126,13 @@ def detect(name: str, data: bytes) -> bool:
 
 
 def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
-    """The picture that a YAML names. For a picture: the YAML of the same name, if its stem is the same."""
+    """The picture that a YAML names, and a mask's parameters. For a picture: the YAML of the same stem."""
     if _is_image(main, data):
         stem = main.rpartition(".")[0]
         return [n for n in names if n in (stem + ".yaml", stem + ".yml")]
     try:
         said = _yaml.load(data, Limits(yaml_nodes=10_000))["image"]
-        return [n for n in [_find_image(str(said), main, names)[0]] if n]
+        return [n for n in [_find_image(str(said), main, names)[0]] if n] + _masks.companions(main, names)
     except (*BAD_INPUT, FleetMapError):  # the reader says what is wrong with it
         return []
 
@@ -261,6 +264,8 @@ def _layers(
         line = _line(files[main], "origin") if main != picture else None
         reason = f"the origin is turned by {yaw:g} rad; Nav2 ignores that: ask for the map with normalize=true"
         context.warn(reason, file=main, line=line, where="origin")
+    told = next((n for n in _masks.companions(main, list(files)) if n != picture), None) if main != picture else None
+    meaning = _masks.read(told, files[told], context) if told else {}
     try:
         if context.cells:
             shades = _image.read_grey(files[picture], context.limits)
@@ -279,7 +284,7 @@ def _layers(
         said["occupied_thresh"],
         said["free_thresh"],
         said["negate"],
-        {NAME: extra} if extra else {},
+        {**({NAME: extra} if extra else {}), **meaning},
     )
     name = context.grid or main.rpartition("/")[2].rpartition(".")[0] or MAP
     return Layers({PartKey("occupancy", context.level, name): grid})
@@ -337,7 +342,10 @@ def _line(data: bytes, key: str) -> int | None:
 
 # --- writing ------------------------------------------------------------------------------------------------------
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
-    """``<grid>.yaml`` and its picture. Raises MissingLayer, NotFound, Ambiguous, or Invalid for impossible options."""
+    """``<grid>.yaml`` and its picture, and ``<grid>_filter_info.yaml`` of a mask.
+
+    Raises MissingLayer, NotFound, Ambiguous, or Invalid for impossible options.
+    """
     options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
     key = choose(sorted(layers.grids()), options)[0]
     grid = layers.grids()[key]
@@ -352,7 +360,8 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         reason = f"the origin is turned by {grid.origin[2]:g} rad; Nav2 ignores that: ask for normalize=true"
         context.warn(reason, file=stem + ".yaml", where="origin")
     picture = f"{stem}.{kind}"
-    return {stem + ".yaml": _yaml_text(grid, picture), picture: _picture(grid, pixels, kind)}
+    made = {stem + ".yaml": _yaml_text(grid, picture), picture: _picture(grid, pixels, kind)}
+    return made | _masks.write(grid, stem, context)
 
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
@@ -362,8 +371,11 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
 
 
 def by_file(name: str) -> dict[str, str]:
-    """``keepout.yaml`` and ``keepout.pgm`` are the grid ``keepout``; ``keepout.png`` asks for a PNG, too."""
+    """``keepout.yaml``, ``keepout.pgm`` and ``keepout_filter_info.yaml`` are the grid ``keepout``; ``keepout.png`` asks
+    for a PNG, too."""
     stem, _, end = name.rpartition(".")
+    if f".{end}" in YAML_ENDS:
+        stem = stem.removesuffix(_masks.SUFFIX)
     if not stem or f".{end}" not in (*YAML_ENDS, ".pgm", ".png"):
         return {}
     return {"grid": stem, **({"file_type": end} if end in ("pgm", "png") else {})}
@@ -622,6 +634,7 @@ register(
         by_file=by_file,
         check=_occupancy_grid_rules.check,
         rank=40,
+        version=2,
         extensions=(*YAML_ENDS, *IMAGE_ENDS),
     )
 )

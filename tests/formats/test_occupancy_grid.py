@@ -6,6 +6,7 @@ import io
 import json
 import math
 import random
+import re
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -102,7 +104,8 @@ def test_real_maps_have_the_counted_cells_and_come_back(shared: Path, facts_json
         original = {main: files[main], picture: files[picture]}
         for kind in ("pgm", "png"):
             served, told = write(layers, file_type=kind)
-            assert list(served) == [main, main.removesuffix("yaml") + kind]
+            mask = [main.replace(".yaml", "_filter_info.yaml")] if re.search("keepout|speed|nogo", main) else []
+            assert list(served) == [main, main.removesuffix("yaml") + kind, *mask]
             assert same("occupancy_grid", original, served) == [], (name, kind)
             assert told.warnings == told.dropped == [], name
 
@@ -172,10 +175,14 @@ def test_samples_have_their_facts(name: str, facts: Any, same: Same) -> None:
     assert {**found, **{k: int(v) for k, v in corners.items()}} == known
     assert (independent(files, facts) == grid.cells).all()
     main = name.rpartition("/")[2]
-    served, _ = write(Layers({PartKey("occupancy", name=main.removesuffix(".yaml")): grid}))
+    served, told = write(Layers({PartKey("occupancy", name=main.removesuffix(".yaml")): grid}))
     assert same("occupancy_grid", files, served) == []
     again, _ = read(served)
-    assert (again.origin, again.negate, again.properties) == (grid.origin, grid.negate, grid.properties)
+    assert (again.origin, again.negate) == (grid.origin, grid.negate)
+    filled = [t["what"] for t in told.template]
+    assert filled == (["filter info: type, base, multiplier"] if name == "speed/speed.yaml" else [])
+    if not filled:
+        assert again.properties == grid.properties
 
 
 # --- telling and finding ------------------------------------------------------------------------------------------
@@ -398,8 +405,8 @@ def test_the_grid_that_is_asked_for() -> None:
     speed, upper = PartKey("occupancy", name="speed"), PartKey("occupancy", "L1", "map")
     attic = PartKey("occupancy", "L2", "map")
     assert made(layers(ground, keepout)) == ["map.yaml", "map.pgm"]
-    assert made(layers(keepout)) == ["keepout.yaml", "keepout.pgm"]
-    assert made(layers(ground, keepout), grid="keepout") == ["keepout.yaml", "keepout.pgm"]
+    assert made(layers(keepout)) == ["keepout.yaml", "keepout.pgm", "keepout_filter_info.yaml"]
+    assert made(layers(ground, keepout), grid="keepout") == ["keepout.yaml", "keepout.pgm", "keepout_filter_info.yaml"]
     assert b"P5\n1 1\n" in write(layers(ground, upper))[0]["map.pgm"]
     assert b"P5\n2 1\n" in write(layers(ground, upper), level="L1")[0]["map.pgm"]
     with pytest.raises(Ambiguous, match="keepout, speed"):
@@ -745,3 +752,81 @@ def test_any_bytes_are_refused_or_read(data: bytes, after: bool) -> None:
 def test_detect_is_quick_on_anything() -> None:
     for piece in (b" ", b"{", b"#\n", b"image:", b"\n", b"---", b'"', b"image: resolution: ", b"%a\n"):
         assert FORMAT.detect("x", piece * (2**22 // len(piece))) in (True, False)
+
+
+# --- costmap filter masks -----------------------------------------------------------------------------------------
+MASK = {p.name: p.read_bytes() for p in (SAMPLES / "mask").iterdir()}
+
+
+def info_of(files: dict[str, bytes], name: str) -> dict[str, Any]:
+    said: dict[str, Any] = yaml.safe_load(files[name])["costmap_filter_info_server"]["ros__parameters"]
+    return said
+
+
+def test_a_masks_parameters_come_back_with_it() -> None:
+    grid, context = read(MASK)
+    assert context.warnings == []
+    served, told = write(Layers({PartKey("occupancy", name="slow_mask"): grid}))
+    assert list(served) == ["slow_mask.yaml", "slow_mask.pgm", "slow_mask_filter_info.yaml"]
+    once, now = (yaml.safe_load(f) for f in (MASK["slow_params.yaml"], served["slow_mask_filter_info.yaml"]))
+    assert now == once
+    assert info_of(served, "slow_mask_filter_info.yaml")["type"] == 2
+    base = info_of(served, "slow_mask_filter_info.yaml")["base"]
+    assert type(base) is float, "ROS refuses a whole number for a parameter declared as double"
+    assert told.template == told.warnings == []
+    again, _ = read(served)
+    assert write(Layers({PartKey("occupancy", name="slow_mask"): again}))[0] == served
+
+
+def test_a_mask_that_does_not_say_what_it_means_gets_nav2s_usual_values() -> None:
+    grid = grid_of([[0, 100]])
+    served, told = write(Layers({PartKey("occupancy", name="keepout"): grid}))
+    assert info_of(served, "keepout_filter_info.yaml") == {
+        "type": 0, "base": 0.0, "multiplier": 1.0, "mask_topic": "/keepout_filter_mask",
+        "filter_info_topic": "/keepout_costmap_filter_info",
+    }  # fmt: skip
+    server = yaml.safe_load(served["keepout_filter_info.yaml"])["filter_mask_server"]["ros__parameters"]
+    assert server == {"frame_id": "map", "topic_name": "/keepout_filter_mask", "yaml_filename": "keepout.yaml"}
+    assert [t["value"] for t in told.template] == [{"type": 0, "base": 0.0, "multiplier": 1.0}]
+    served, told = write(Layers({PartKey("occupancy", name="speed_zone"): grid_of([[0, 50], [255, 0]])}))
+    said = info_of(served, "speed_zone_filter_info.yaml")
+    assert (said["type"], said["base"], said["multiplier"]) == (1, 100.0, -1.0)
+    assert any("unknown cells" in w.problem for w in told.warnings)
+    assert list(write(grid)[0]) == ["map.yaml", "map.pgm"]
+
+
+def test_parameter_files_of_namespaces_and_of_others() -> None:
+    told = yaml.safe_load(MASK["slow_params.yaml"])
+    within = {**MASK, "slow_params.yaml": yaml.safe_dump({"robot_1": {"nav": told}, "amcl": {"x": 1}}).encode()}
+    grid, _ = read(within)
+    served, _ = write(Layers({PartKey("occupancy", name="slow_mask"): grid}))
+    assert yaml.safe_load(served["slow_mask_filter_info.yaml"]) == {"robot_1": {"nav": told}, "amcl": {"x": 1}}
+    grid, context = read({**MASK, "slow_params.yaml": b"amcl: {ros__parameters: {alpha1: 0.2}}"})
+    assert grid.properties == {}
+    assert "no parameters" in context.warnings[0].problem
+    both = {"a": told["costmap_filter_info_server"], "b": told["costmap_filter_info_server"]}
+    _, context = read({**MASK, "slow_params.yaml": yaml.safe_dump(both).encode()})
+    assert "2 filter info servers" in context.warnings[0].problem
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "where"),
+    [
+        (b"type: 2", b"type: 7", "type"),
+        (b"type: 2", b"type: true", "type"),
+        (b"multiplier: 0.01", b"multiplier: fast", "multiplier"),
+        (b"base: 0", b"base: [0]", "base"),
+        (b'"/slow_filter_mask"\n    base', b"3\n    base", "mask_topic"),
+    ],
+)
+def test_wrong_parameters_are_named(old: bytes, new: bytes, where: str) -> None:
+    files = {**MASK, "slow_params.yaml": MASK["slow_params.yaml"].replace(old, new)}
+    assert files != MASK
+    with pytest.raises(UnreadableFile) as caught:
+        read(files)
+    assert [(p.file, p.where) for p in caught.value.problems] == [("slow_params.yaml", where)]
+
+
+def test_a_masks_files_are_asked_for_by_name() -> None:
+    assert occupancy_grid.by_file("keepout_filter_info.yaml") == {"grid": "keepout"}
+    assert occupancy_grid.by_file("keepout.yaml") == {"grid": "keepout"}

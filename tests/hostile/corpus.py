@@ -838,6 +838,37 @@ def network_cases() -> Iterator[Case]:
             "any",
             "rmf_nav_graph",
         )
+    mask = "costmap_filter_info_server:\n  ros__parameters:\n    type: {t}\n    base: {b}\n    mask_topic: {m}\n"
+    for k, (t, b, m) in enumerate(
+        (
+            ("9", "0.0", "a"),
+            ("1", ".nan", "a"),
+            ("1.5", "0.0", "a"),
+            ("1", HUGE, "a"),
+            ("1", "0.0", "[a]"),
+            ("-1", "0.0", "a"),
+            ("!!python/name:os.system 1", "0.0", "a"),
+        )
+    ):
+        yield Case(
+            f"mask/parameters {k}",
+            {**room(), "room_filter_info.yaml": mask.format(t=t, b=b, m=m).encode()},
+            "refused",
+            "occupancy_grid",
+        )
+    for k, text in enumerate(
+        (
+            "",
+            "[",
+            "3",
+            "[1]",
+            "a: &a {b: *a}",
+            "a: " * 200 + "1",
+            "costmap_filter_info_server: 3\n",
+            "costmap_filter_info_server: {ros__parameters: 3}\n",
+        )
+    ):
+        yield Case(f"mask/file {k}", {**room(), "room_filter_info.yaml": text.encode()}, "any", "occupancy_grid")
     plain = PRM.format(id=1, x=1, a=1, w=1, more="")
     yield Case("prm/without its map", {"p.yaml": plain.encode()}, "refused", "prm")
     yield Case(

@@ -1,0 +1,64 @@
+"""Nav2's costmap filter masks: grids that say keepout zones or speed limits, and what their cells mean.
+
+A mask is an occupancy grid of its own; the value in filter space is ``base + multiplier * cell`` of ``type`` 0 (keepout
+and preferred lanes, 0…100), 1 (speed limit in % of the robot's), 2 (speed limit in m/s), 3 (binary) or 4 (zone
+parameters). In a speed mask cell 0 is no limit, and unknown an error. Users give these to the node
+``costmap_filter_info_server`` in a YAML of ROS parameters; the mask's own map server may stand in the same file.
+Source: docs.nav2.org, Costmap Filter Info Server; nav2_costmap_2d, costmap_filters.
+
+A grid keeps this file under ``properties.costmap_filter`` as ``{params: …}``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+NAME = "costmap_filter"
+NODE = "costmap_filter_info_server"
+PARAMETERS = "ros__parameters"
+KEEPOUT, SPEED_PERCENT, SPEED_METRES = 0, 1, 2
+TYPES = range(5)
+DEEPEST = 4
+"""Namespaces around a node that are looked into."""
+
+
+@dataclass(frozen=True, slots=True)
+class Info:
+    """What a mask's cells mean: value = base + multiplier * cell."""
+
+    type: int
+    base: float
+    multiplier: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """In Nav2's words."""
+        return {"type": self.type, "base": self.base, "multiplier": self.multiplier}
+
+
+def params(name: str, info: Info) -> dict[str, Any]:
+    """The parameter file of a mask that has none: of its filter info server and its map server. name: of the grid."""
+    word = re.sub(r"[^A-Za-z0-9_]", "_", name)
+    topic = f"/{word}_filter_mask"
+    told = {**info.as_dict(), "filter_info_topic": f"/{word}_costmap_filter_info", "mask_topic": topic}
+    server = {"frame_id": "map", "topic_name": topic, "yaml_filename": f"{name}.yaml"}
+    return {NODE: {PARAMETERS: told}, "filter_mask_server": {PARAMETERS: server}}
+
+
+def is_filter_info(name: str, node: Any) -> bool:
+    """Whether this entry of a parameter file is a filter info server's."""
+    said = node.get(PARAMETERS) if isinstance(node, Mapping) else None
+    return isinstance(said, Mapping) and ("mask_topic" in said or NODE in name)
+
+
+def servers(document: Any, depth: int = 0) -> Iterator[Mapping[str, Any]]:
+    """The parameters of each filter info server in a parameter file, in order."""
+    if not isinstance(document, Mapping) or depth > DEEPEST:
+        return
+    for name, node in document.items():
+        if is_filter_info(name, node):
+            yield node[PARAMETERS]
+        elif isinstance(node, Mapping) and PARAMETERS not in node:
+            yield from servers(node, depth + 1)
