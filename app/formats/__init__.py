@@ -14,6 +14,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
@@ -332,20 +333,27 @@ def write(known: Format, layers: Layers, context: WriteContext) -> dict[str, byt
         context.options = known.write_options()
     with _without_collector():
         files = known.write(layers, context)
-    context.warnings = _joined(context.warnings, check(known, files))
+    told = SERVED.set(True)
+    try:
+        context.warnings = _joined(context.warnings, check(known, files))
+    finally:
+        SERVED.reset(told)
     return files
 
 
 LISTED = 50
 """Findings of each level that a check tells one by one; of further ones it tells the number."""
 
+SERVED: ContextVar[bool] = ContextVar("SERVED", default=False)
+"""Whether what is checked was just written here, so that of a large text a look at its head must do."""
+
 
 def check(known: Format, files: Files) -> list[Problem]:
     """What the consumers of a map would refuse (level ``error``) or may not like (``warning``), errors first.
 
-    files: the map's, main file first. This runs on each map that is served, so a format's ``check`` looks at headers
-    and bytes rather than parse a large file slowly. It yields problems from its loader's rules and raises what is
-    natural where the files do not parse at all, which is an error too.
+    files: the map's, main file first. This runs on each map that is served, where it may cost a few milliseconds
+    (``_rules.brief``). A format's ``check`` yields problems from its loader's rules and raises what is natural where
+    the files do not parse at all, which is an error too.
     """
     if known.check is None or not files:
         return []
@@ -353,7 +361,9 @@ def check(known: Format, files: Files) -> list[Problem]:
     found: dict[str, list[Problem]] = {"error": [], "warning": []}
     more = {"error": 0, "warning": 0}
     seen: set[tuple[str | None, str | None, str]] = set()
-    for one in _findings(known, files, main):
+    with _without_collector():
+        every = list(_findings(known, files, main))
+    for one in every:
         problem = replace(one, file=one.file or main, level=one.level or "error")
         told = (problem.file, problem.where, problem.problem)
         if told in seen:

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeGuard
 
 from app.errors import Problem
-from app.formats import Limits
+from app.formats import SERVED, Limits
 
 LIMITS = Limits()
 """A check reads what is served, or files that the user of a command line has: within the usual bounds."""
 
+BRIEFLY = 2**19
+HEAD = 2**13
+"""Of a larger text that was just written here, only so much of its beginning is looked at."""
+
 SHOWN = 5
+
+
+def brief(data: bytes) -> bool:
+    """Whether this text is too large to be read once more while somebody waits for it."""
+    return len(data) > BRIEFLY and SERVED.get()
 
 
 def refused(problem: str, file: str | None = None, *, line: int | None = None, where: str | None = None) -> Problem:
@@ -39,7 +49,7 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:59] + "…"
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: Any) -> TypeGuard[float]:
     """A finite JSON or YAML number; a truth value is none."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
@@ -74,3 +84,22 @@ def cpp_bool(text: Any) -> bool | None:
     if text in _TRUE or text in _FALSE:
         return text in _TRUE
     return None
+
+
+LARGEST = 8 * 2**20
+"""Bytes of YAML up to which a check reads a file as a whole."""
+
+
+def mappings(value: Any) -> list[tuple[int, dict[str, Any]]]:
+    """The mappings of a list, with their places; of anything else nothing."""
+    return [(k, v) for k, v in enumerate(value) if isinstance(v, dict)] if isinstance(value, list) else []
+
+
+def repeated(items: Iterable[Any]) -> list[Any]:
+    """Each item that occurs more than once, in order."""
+    return [item for item, count in Counter(items).items() if count > 1]
+
+
+def missing(said: Any, keys: Iterable[str]) -> list[str]:
+    """Which of the keys a mapping lacks."""
+    return [key for key in keys if not isinstance(said, dict) or said.get(key) is None]

@@ -22,7 +22,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _yaml, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _datum_rules, _yaml, register
 from app.formats._text import DEGREES
 from app.model.features import Features, features
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum
@@ -331,6 +331,7 @@ register(
         carries=frozenset({"location"}),
         detect=detect,
         read=read,
+        check=_datum_rules.check,
         write=write,
         needs=Needs(one_of=(frozenset({"location"}),), anchor="wgs84", datum=True),
         family=NAME,

@@ -7,7 +7,7 @@ Source: OGC 12-007r2 (KML 2.3), Google's ``gx`` extension.
 
 from __future__ import annotations
 
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _kml_rules, register
 from app.formats._archive import is_archive
 from app.formats._kml import FAMILY, MAIN, read_kml
 from app.formats._kml_writing import write_kml
@@ -48,6 +48,7 @@ register(
         carries=frozenset({"location", "objects", "topology", "zones", "occupancy"}),
         detect=detect,
         read=read,
+        check=_kml_rules.check,
         write=write,
         needs=Needs(
             (

@@ -7,7 +7,7 @@ takes it; every other entry is kept byte for byte. Grids travel here with their 
 from __future__ import annotations
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _kml_rules, register
 from app.formats import _archive as archive
 from app.formats._kml import FAMILY, read_kml
 from app.formats._kml_writing import write_kml
@@ -78,6 +78,7 @@ register(
         carries=frozenset({"location", "objects", "topology", "zones", "occupancy", "resources"}),
         detect=detect,
         read=read,
+        check=_kml_rules.check_archive,
         write=write,
         needs=Needs(
             (

@@ -28,7 +28,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _json, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _json, _lif_rules, register
 from app.formats._network import (
     AMONG_PARTS,
     SAME_ANGLE,
@@ -718,6 +718,7 @@ register(
         carries=frozenset({"topology", "objects"}),
         detect=detect,
         read=read,
+        check=_lif_rules.check,
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=WriteOptions,

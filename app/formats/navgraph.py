@@ -27,7 +27,7 @@ import numpy as np
 import shapely
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _yaml, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _navgraph_rules, _yaml, register
 from app.formats._network import (
     AMONG_PARTS,
     Array,
@@ -578,6 +578,7 @@ register(
         carries=frozenset({"topology"}),
         detect=detect,
         read=read,
+        check=_navgraph_rules.check,
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
         family=NAME,

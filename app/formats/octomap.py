@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import NotFound, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _octomap_rules, register
 from app.formats._choice import the_one
 from app.model.frame import is_writable
 from app.model.layers import MAP, Layers, PartKey
@@ -533,6 +533,7 @@ register(
         carries=frozenset({"voxels"}),
         detect=detect,
         read=read,
+        check=_octomap_rules.check,
         write=write,
         needs=Needs((frozenset({"voxels"}),)),
         write_options=WriteOptions,

@@ -39,7 +39,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import MissingLayer
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _rmf, _yaml, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _openrmf_rules, _rmf, _yaml, register
 from app.formats._rmf import BUILDING, NAV_GRAPH, Array, Flow, index, listing, mapping, number, own, refuse, value_of
 from app.formats._text import DEGREES, METRES, numbers
 from app.model.features import Features, Properties, features, from_columns, points, segments, unique_ids
@@ -1234,6 +1234,7 @@ register(
         carries=frozenset({"topology", "objects", "resources"}),
         detect=detect,
         read=read,
+        check=_openrmf_rules.check,
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
         companions=companions,

@@ -29,7 +29,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import MissingLayer
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _rmf, _yaml, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _rmf, _rmf_nav_graph_rules, _yaml, register
 from app.formats._rmf import (
     BUILDING,
     CABIN_HEIGHT,
@@ -724,6 +724,7 @@ register(
         carries=frozenset({"topology", "objects"}),
         detect=detect,
         read=read,
+        check=_rmf_nav_graph_rules.check,
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"objects"})),
         family=NAME,

@@ -5,7 +5,7 @@ See ``app.formats._tmap``. The older list (``tmap``) is read too where a sender 
 
 from __future__ import annotations
 
-from app.formats import Format, Needs, WriteContext, _tmap, register
+from app.formats import Format, Needs, WriteContext, _tmap, _tmap2_rules, register
 from app.model.layers import Layers
 
 FILE = "network.tmap2.yaml"
@@ -36,6 +36,7 @@ register(
         carries=frozenset({"topology", "objects"}),
         detect=detect,
         read=_tmap.read,
+        check=_tmap2_rules.check,
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=_tmap.WriteOptions,

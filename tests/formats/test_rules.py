@@ -5,24 +5,29 @@ The bad files are written by hand after the loaders' sources; what is asserted i
 
 from __future__ import annotations
 
+import gzip
+import io
 import json
 import struct
+import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from app import formats
+from app.bundle import Hints
 from app.convert import make, offline
 from app.convert.recipe import Chain
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, Format, Needs, WriteContext
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey
-from tests.formats.test_every_format import CASES
+from tests.formats.test_every_format import CASES, HERE, mutations
 
 ERROR, WARNING = "error", "warning"
 Found = set[tuple[str | None, str | None]]
@@ -34,13 +39,13 @@ def found(name: str, files: dict[str, bytes]) -> Found:
 
 
 @pytest.mark.parametrize(("name", "files"), CASES)
-def test_what_is_served_of_a_good_sample_would_be_loaded(name: str, files: dict[str, bytes]) -> None:
-    from app.bundle import Hints
-    from tests.formats.test_every_format import HERE
-
-    made = offline(files, name, hints=Hints(name), datum=HERE)
-    refused = [w for w in made.report["warnings"] if w.get("level") == ERROR]
-    assert refused == []
+def test_what_is_served_would_be_loaded_where_the_sample_would(name: str, files: dict[str, bytes]) -> None:
+    """Samples with dangling edges and the like come back with them, and with an error."""
+    served = offline(files, name, hints=Hints(name), datum=HERE)
+    groups, _ = formats.group(files, name)
+    bad = any(p.level == ERROR for g in groups for p in formats.check(g.format, g.files))
+    refused = [w for w in served.report["warnings"] if w.get("level") == ERROR]
+    assert bad or not refused
 
 
 # --- the runner ---------------------------------------------------------------------------------------------------
@@ -273,3 +278,431 @@ def test_far_nodes_lose_millimetres() -> None:
     files = {"g.geojson": graph()["g.geojson"].replace(b"[0, 2.5]", b"[16385, 2.5]")}
     told = formats.check(formats.get_format("nav2_route"), files)
     assert [(p.level, "2 mm" in p.problem) for p in told] == [(WARNING, True)]
+
+
+# --- topological_navigation ---------------------------------------------------------------------------------------
+def tmap2(change: Callable[[dict[str, Any]], object] = lambda top: None) -> dict[str, Any]:
+    """A with an edge to B, after the schema, then changed."""
+    pose = {"orientation": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}, "position": {"x": 0.0, "y": 0.0, "z": 0.0}}
+    edge = {"action": "move_base", "edge_id": "A_B", "node": "B"}
+    nodes = [
+        {
+            "meta": {"map": "farm", "node": name, "pointset": "farm"},
+            "node": {"edges": edges, "name": name, "parent_frame": "map", "pose": pose},
+        }
+        for name, edges in (("A", [edge]), ("B", []))
+    ]
+    top: dict[str, Any] = {"meta": {"last_updated": "2024-05-01_10-00-00"}}
+    top |= {"metric_map": "farm", "name": "farm", "nodes": nodes, "pointset": "farm"}
+    top = json.loads(json.dumps(top))
+    change(top)
+    return top
+
+
+def first(top: dict[str, Any]) -> Any:
+    return top["nodes"][0]["node"]
+
+
+TMAP2: list[Any] = [
+    (lambda top: None, set()),
+    (lambda top: top.pop("pointset"), {(ERROR, "pointset")}),
+    (lambda top: top["meta"].update(last_updated=0), {(ERROR, "meta.last_updated")}),
+    (lambda top: top["meta"].update(last_updated="2024-05-01"), {(ERROR, "meta.last_updated")}),
+    (lambda top: top.update(name=7), {(ERROR, "name")}),
+    (lambda top: top["nodes"][0]["meta"].pop("map"), {(ERROR, "nodes[0].meta")}),
+    (lambda top: top["nodes"][0]["meta"].update(node="C"), {(WARNING, "nodes[0].meta.node")}),
+    (lambda top: first(top).pop("parent_frame"), {(ERROR, "nodes[0].node")}),
+    (lambda top: first(top).pop("pose"), {(ERROR, "nodes[0].node.pose")}),
+    (lambda top: first(top)["edges"][0].pop("edge_id"), {(ERROR, "nodes[0].node.edges[0]")}),
+    (lambda top: first(top)["edges"][0].update(node="C", edge_id="A_C"), {(ERROR, "nodes")}),
+    (lambda top: first(top)["edges"][0].update(edge_id="e1"), {(WARNING, "nodes")}),
+    (lambda top: first(top)["edges"].append(first(top)["edges"][0]), {(WARNING, "nodes")}),
+    (lambda top: top["nodes"].append(top["nodes"][1]), {(WARNING, "nodes")}),
+    (lambda top: top["nodes"][0]["meta"].update(node=3) or first(top).update(name=3), {
+        (ERROR, "nodes[0].node.name"), (WARNING, "nodes")}),
+    (lambda top: top.update(nodes={}), {(ERROR, "nodes")}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "expected"), TMAP2)
+def test_topological_navigation(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
+    """The same for a file that is laid out as PyYAML does, which is counted, and for one that is parsed."""
+    top = tmap2(change)
+    assert found("tmap2", {"a.tmap2.yaml": json.dumps(top).encode()}) == expected, "parsed"
+    block = yaml.dump(json.loads(json.dumps(top)), default_flow_style=False).encode()
+    assert found("tmap2", {"a.tmap2.yaml": block}) == expected, "counted"
+
+
+def test_a_regular_network_is_not_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
+    from app.formats import _tmap2_rules
+
+    def parse(*_: Any) -> Any:
+        raise AssertionError
+
+    monkeypatch.setattr(_tmap2_rules._yaml, "load", parse)
+    block = yaml.dump(tmap2(), default_flow_style=False).encode()
+    assert found("tmap2", {"a.tmap2.yaml": block}) == set()
+
+
+def test_of_a_large_network_that_is_served_the_head_is_looked_at() -> None:
+    text = yaml.dump(tmap2(lambda top: top["meta"].update(last_updated=0)), default_flow_style=False).encode()
+    files = {"a.tmap2.yaml": text + b"# " + bytes([120]) * 2**20 + b"\n"}
+    token = formats.SERVED.set(True)
+    try:
+        assert found("tmap2", files) == {(ERROR, "meta.last_updated")}
+    finally:
+        formats.SERVED.reset(token)
+
+
+# --- Open-RMF -----------------------------------------------------------------------------------------------------
+def building(change: Callable[[dict[str, Any]], object] = lambda top: None) -> dict[str, bytes]:
+    level = {
+        "vertices": [[0, 0, 0, "a"], [10, 0, 0, "b", {"is_charger": [4, True]}], [10, 9, 0, ""]],
+        "lanes": [[0, 1, {"graph_idx": [2, 0], "bidirectional": [4, True], "speed_limit": [3, 0]}]],
+        "measurements": [[0, 1, {"distance": [3, 5.0]}]],
+        "doors": [[0, 2, {"name": [1, "d"], "type": [1, "hinged"]}]],
+        "floors": [{"vertices": [0, 1, 2], "parameters": {}}],
+        "fiducials": [[1, 2, "f"], [3, 4, "g"]],
+        "elevation": 0.0,
+    }
+    lift = {"depth": 1.0, "width": 1.0, "yaw": 0.0, "x": 1.0, "y": 1.0, "reference_floor_name": "L1"}
+    door = {"door_type": 2, "x": 0.0, "y": 1.0, "motion_axis_orientation": 0.0, "width": 1.0}
+    lift |= {"doors": {"d1": door}, "level_doors": {"L1": ["d1"]}}
+    top: dict[str, Any] = {"name": "b", "coordinate_system": "reference_image", "levels": {"L1": level, "L2": level}}
+    top["lifts"] = {"lift": lift}
+    top = json.loads(json.dumps(top))
+    change(top)
+    return {"building.yaml": json.dumps(top).encode()}
+
+
+def level1(top: dict[str, Any]) -> Any:
+    return top["levels"]["L1"]
+
+
+RMF: list[Any] = [
+    (lambda top: None, set()),
+    (lambda top: top.pop("name"), {(ERROR, "name")}),
+    (lambda top: top.update(coordinate_system="metres"), {(ERROR, "coordinate_system")}),
+    (lambda top: top.pop("levels"), {(ERROR, "levels")}),
+    (lambda top: top.update(reference_level_name="L9"), {(ERROR, "reference_level_name")}),
+    (lambda top: top.update(parameters={"p": 3}), {(ERROR, "parameters.p")}),
+    (lambda top: top.update(parameters={"p": [2, 1.5]}), {(ERROR, "parameters.p")}),
+    (lambda top: top.update(parameters={"p": [4, 1]}), {(ERROR, "parameters.p")}),
+    (lambda top: level1(top)["vertices"][0].pop(), {(ERROR, "levels.L1.vertices[0]")}),
+    (lambda top: level1(top)["vertices"][2].__setitem__(3, "a"), {(WARNING, "levels.L1.vertices")}),
+    (lambda top: level1(top)["lanes"][0].__setitem__(1, 3), {(ERROR, "levels.L1.lanes[0]")}),
+    (lambda top: level1(top)["lanes"][0].__setitem__(0, -1), {(ERROR, "levels.L1.lanes[0]")}),
+    (lambda top: level1(top)["lanes"][0][2].update(graph_idx=[2, 9]), {(WARNING, "levels.L1.lanes[0]")}),
+    (lambda top: level1(top).update(measurements=[]), {(WARNING, "levels.L1.measurements")}),
+    (lambda top: level1(top)["measurements"][0].__setitem__(2, {}), {(ERROR, "levels.L1.measurements[0]")}),
+    (lambda top: level1(top)["measurements"][0].__setitem__(1, 0), {(ERROR, "levels.L1.measurements[0]")}),
+    (lambda top: level1(top)["doors"][0][2].pop("type"), {(ERROR, "levels.L1.doors[0]")}),
+    (lambda top: level1(top)["doors"][0][2].update(type=[1, "swing"]), {(WARNING, "levels.L1.doors[0]")}),
+    (lambda top: level1(top)["floors"][0].update(vertices=[0, 1, 7]), {(ERROR, "levels.L1.floors[0]")}),
+    (lambda top: level1(top).update(fiducials=[]), {(WARNING, "levels.L2.fiducials")}),
+    (lambda top: level1(top)["fiducials"].append([1]), {(ERROR, "levels.L1.fiducials[2]")}),
+    (lambda top: level1(top).update(drawing={}), {(ERROR, "levels.L1.drawing")}),
+    (lambda top: level1(top).update(drawing={"filename": "x.png"}), {(WARNING, "levels.L1.drawing.filename")}),
+    (lambda top: top["lifts"]["lift"].pop("yaw"), {(ERROR, "lifts.lift")}),
+    (lambda top: top["lifts"]["lift"].update(reference_floor_name="X"), {(ERROR, "lifts.lift.reference_floor_name")}),
+    (lambda top: top["lifts"]["lift"]["level_doors"].update(X=[]), {(ERROR, "lifts.lift.level_doors")}),
+    (lambda top: top["lifts"]["lift"]["doors"]["d1"].pop("width"), {(ERROR, "lifts.lift.doors.d1")}),
+    (lambda top: top.update(coordinate_system="web_mercator"), {
+        (ERROR, "parameters.generate_crs"), (WARNING, "parameters.generate_origin_vertex")}),
+    (lambda top: top.update(coordinate_system="wgs84", parameters={
+        "generate_crs": [1, "EPSG:32630"], "suggested_offset_x": [3, 1.0], "suggested_offset_y": [3, 1.0]}),
+        {(WARNING, "parameters.generate_crs")}),
+    (lambda top: top.update(coordinate_system="wgs84", parameters={"generate_crs": [1, "EPSG:3414"]}), {
+        (ERROR, "parameters.suggested_offset_x"), (ERROR, "parameters.suggested_offset_y")}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "expected"), RMF)
+def test_building_map_generator(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
+    assert found("openrmf", building(change)) == expected
+
+
+def nav(change: Callable[[dict[str, Any]], object] = lambda top: None) -> dict[str, bytes]:
+    level = {"vertices": [[0, 0, {"name": "a"}], [1.5, 0, {"name": ""}]], "lanes": [[0, 1, {}], [1, 0, {}]]}
+    top: dict[str, Any] = {"building_name": "b", "levels": {"L1": level, "L2": {"vertices": [], "lanes": []}}}
+    top |= {"doors": {"d": {"endpoints": [[0, 0], [1, 1]], "map": "L1"}}}
+    top |= {"lifts": {"l": {"position": [0, 0, 0], "dims": [1, 1]}}}
+    top = json.loads(json.dumps(top))
+    change(top)
+    return {"0.yaml": json.dumps(top).encode()}
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda top: None, set()),
+        (lambda top: top.pop("levels"), {(ERROR, "levels")}),
+        (lambda top: level1(top).pop("lanes"), {(ERROR, "levels.L1")}),
+        (lambda top: level1(top)["vertices"][0].pop(), {(ERROR, "levels.L1.vertices[0]")}),
+        (lambda top: level1(top)["vertices"][1][2].update(name="a"), {(ERROR, "levels")}),
+        (lambda top: level1(top)["vertices"][1][2].update(lift="x"), {(WARNING, "levels.L1.vertices[1]")}),
+        (lambda top: level1(top)["lanes"][0].__setitem__(1, 2), {(ERROR, "levels.L1.lanes[0]")}),
+        (lambda top: level1(top)["lanes"][0].pop(), {(ERROR, "levels.L1.lanes[0]")}),
+        (
+            lambda top: level1(top)["lanes"][0][2].update(orientation_constraint="sideways"),
+            {(ERROR, "levels.L1.lanes[0].orientation_constraint")},
+        ),
+        (lambda top: level1(top)["lanes"][0][2].update(speed_limit="1"), {(ERROR, "levels.L1.lanes[0].speed_limit")}),
+        (lambda top: top["doors"]["d"].pop("map"), {(ERROR, "doors.d")}),
+        (lambda top: top["lifts"]["l"].update(dims=[1]), {(ERROR, "lifts.l")}),
+    ],
+)
+def test_fleet_adapter(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
+    assert found("rmf_nav_graph", nav(change)) == expected
+
+
+# --- Fawkes -------------------------------------------------------------------------------------------------------
+FAWKES = """%YAML 1.2
+%TAG ! tag:fawkesrobotics.org,navgraph/
+---
+graph-name: g
+nodes:
+  - {name: A, pos: [0.0, 1]}
+  - {name: B, pos: [2, 1], properties: [home, {width: 3}]}
+  - !unconnected {name: C, pos: [5, 5]}
+connections:
+  - !dir [A, B]
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("", "", set()),
+        ("graph-name: g\n", "", {(ERROR, "graph-name")}),
+        ("name: A, ", "", {(ERROR, "nodes[0]"), (ERROR, "connections")}),
+        ("[0.0, 1]", "[0.0, 1, 2]", {(ERROR, "nodes[0].pos")}),
+        ("[0.0, 1]", "[0.0, east]", {(ERROR, "nodes[0].pos")}),
+        ("name: C", "name: A", {(ERROR, "nodes")}),
+        ("!unconnected ", "", {(ERROR, "nodes")}),
+        ("[A, B]", "[A, D]", {(ERROR, "connections"), (ERROR, "nodes")}),
+        ("[A, B]", "[A]", {(ERROR, "connections[0]"), (ERROR, "nodes")}),
+        ("!dir", "!sometimes", {(WARNING, "connections[0]")}),
+        ("[home, {width: 3}]", "{width: 3}", {(ERROR, "nodes[1].properties")}),
+        ("{width: 3}", "{width: [3]}", {(ERROR, "nodes[1].properties[1]")}),
+        ("%TAG ! tag:fawkesrobotics.org,navgraph/\n", "", {(ERROR, None), (ERROR, "nodes")}),
+        ("  - !dir [A, B]\n", "  - [A, B]\n  - [A, B]\n", {(WARNING, "connections")}),
+    ],
+)
+def test_fawkes(old: str, new: str, expected: Found) -> None:
+    assert old in FAWKES
+    assert found("navgraph", {"g.yaml": FAWKES.replace(old, new, 1).encode()}) == expected
+
+
+# --- OctoMap ------------------------------------------------------------------------------------------------------
+def octree(head: str = "# Octomap OcTree binary file", tree: str = "OcTree", size: int = 3, res: str = "0.1",
+           body: bytes = b"\x07\x00\x02\x00") -> dict[str, bytes]:  # fmt: skip
+    """A root with a free child and an inner one, which has one occupied child: 4 nodes with the root."""
+    return {"a.bt": f"{head}\n#\nid {tree}\nsize {size}\nres {res}\ndata\n".encode() + body}
+
+
+FULL = "# Octomap OcTree file"
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        (octree(size=4, body=b"\x0d\x00\x02\x00"), set()),  # codes 1 (free), 3 (inner); then 2 (occupied)
+        (octree(size=5, body=b"\x0d\x00\x02\x00"), {(WARNING, "size")}),
+        (octree(size=4, body=b"\x0d\x00"), {(ERROR, None)}),
+        (octree(size=4, body=b"\x0d\x00\x02\x00\x00\x00"), {(WARNING, None)}),
+        (octree(size=0, body=b""), set()),
+        (octree(head="# Octomap"), {(ERROR, None)}),
+        (octree(tree="MyTree", size=4, body=b"\x0d\x00\x02\x00"), {(ERROR, "id")}),
+        (octree(res="0", size=4, body=b"\x0d\x00\x02\x00"), {(ERROR, "res")}),
+        (octree(res="x", size=4, body=b"\x0d\x00\x02\x00"), {(ERROR, "res")}),
+        (octree(FULL, size=2, body=bytes(10)), set()),
+        (octree(FULL, size=2, body=bytes(9)), {(ERROR, "size")}),
+        (octree(FULL, size=2, body=bytes(11)), {(WARNING, "size")}),
+        (octree(FULL, "ColorOcTree", size=2, body=bytes(16)), set()),
+    ],
+)
+def test_octomap(files: dict[str, bytes], expected: Found) -> None:
+    assert found("octomap", files) == expected
+
+
+# --- LIF ----------------------------------------------------------------------------------------------------------
+def lif(change: Callable[[dict[str, Any]], object] = lambda top: None) -> dict[str, bytes]:
+    meta = {
+        "projectIdentification": "p",
+        "creator": "c",
+        "exportTimestamp": "2024-05-01T00:00:00Z",
+        "lifVersion": "1.0.0",
+    }
+    nodes = [
+        {
+            "nodeId": i,
+            "nodePosition": {"x": 0.0, "y": 1},
+            "vehicleTypeNodeProperties": [{"vehicleTypeId": "v", "theta": 3.14159265}],
+        }
+        for i in ("n1", "n2")
+    ]
+    edge = {
+        "edgeId": "e1",
+        "startNodeId": "n1",
+        "endNodeId": "n2",
+        "vehicleTypeEdgeProperties": [{"vehicleTypeId": "v"}],
+    }
+    layout: dict[str, Any] = {"layoutId": "l", "layoutVersion": "1", "nodes": nodes, "edges": [edge]}
+    layout["stations"] = [{"stationId": "s", "interactionNodeIds": ["n1"]}]
+    top = json.loads(json.dumps({"metaInformation": meta, "layouts": [layout]}))
+    change(top)
+    return {"a.lif.json": json.dumps(top).encode()}
+
+
+def lay(top: dict[str, Any]) -> Any:
+    return top["layouts"][0]
+
+
+THETA = "layouts[0].nodes[0].vehicleTypeNodeProperties[0].theta"
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda top: None, set()),
+        (lambda top: top["metaInformation"].pop("creator"), {(ERROR, "metaInformation")}),
+        (lambda top: top.pop("layouts"), {(ERROR, "layouts")}),
+        (lambda top: lay(top).pop("layoutId"), {(ERROR, "layouts[0].layoutId")}),
+        (lambda top: lay(top).pop("stations"), {(WARNING, "layouts[0].stations")}),
+        (lambda top: lay(top)["nodes"][0].pop("nodePosition"), {(ERROR, "layouts[0].nodes[0]")}),
+        (lambda top: lay(top)["nodes"].append(lay(top)["nodes"][0]), {(ERROR, "nodeId")}),
+        (lambda top: lay(top)["edges"][0].update(endNodeId="n9"), {(ERROR, "layouts")}),
+        (lambda top: lay(top)["edges"][0].pop("edgeId"), {(ERROR, "layouts[0].edges[0]")}),
+        (
+            lambda top: lay(top)["edges"][0].update(vehicleTypeEdgeProperties=[]),
+            {(ERROR, "layouts[0].edges[0].vehicleTypeEdgeProperties")},
+        ),
+        (lambda top: lay(top)["nodes"][0]["vehicleTypeNodeProperties"][0].update(theta=90), {(WARNING, THETA)}),
+        (lambda top: lay(top)["nodes"][0]["vehicleTypeNodeProperties"][0].update(theta="1"), {(ERROR, THETA)}),
+        (lambda top: lay(top)["stations"][0].update(interactionNodeIds=["x"]), {(ERROR, "layouts")}),
+    ],
+)
+def test_lif(change: Callable[[dict[str, Any]], object], expected: Found) -> None:
+    assert found("lif", lif(change)) == expected
+
+
+# --- KML, KMZ, OSM ------------------------------------------------------------------------------------------------
+KML = """<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Style id="s"/>
+<Placemark id="p"><styleUrl>#s</styleUrl><Point><coordinates>
+ -0.5,53.2,1 </coordinates></Point></Placemark>
+<GroundOverlay><Icon><href>files/a.png</href></Icon></GroundOverlay></Document></kml>"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("", "", set()),
+        ("kml", "gpx", {(ERROR, None)}),
+        (' xmlns="http://www.opengis.net/kml/2.2"', "", {(WARNING, None)}),
+        ('id="p"', 'id="s"', {(WARNING, None)}),
+        ("#s", "#t", {(WARNING, None)}),
+        ("-0.5,53.2,1", "53.2,-180.5", {(ERROR, None)}),
+        ("-0.5,53.2,1", "here", {(ERROR, None)}),
+        ("-0.5,53.2,1", "", set()),
+        ("</Document>", "", {(ERROR, None)}),
+    ],
+)
+def test_kml(old: str, new: str, expected: Found) -> None:
+    assert found("kml", {"a.kml": KML.replace(old, new).encode() if old else KML.encode()}) == expected
+
+
+@pytest.mark.parametrize(
+    ("members", "expected"),
+    [
+        ({"doc.kml": KML, "files/a.png": "x"}, set()),
+        ({"doc.kml": KML}, {(WARNING, None)}),
+        ({"in/doc.kml": KML, "in/files/a.png": "x"}, set()),
+        ({"doc.kml": KML, "b.kml": KML, "files/a.png": "x"}, {(WARNING, None)}),
+        ({"files/a.png": "x"}, {(ERROR, None)}),
+    ],
+)
+def test_kmz(members: dict[str, str], expected: Found) -> None:
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as z:
+        for name, text in members.items():
+            z.writestr(name, text)
+    assert found("kmz", {"a.kmz": data.getvalue()}) == expected
+
+
+OSM = """<osm version="0.6"><bounds/>
+<node id="1" version="1" lat="53" lon="-0.5"/><node id="2" version="1" lat="53" lon="-0.6"/>
+<way id="1" version="1"><nd ref="1"/><nd ref="2"/></way>
+<relation id="1" version="1"/></osm>"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("", "", set()),
+        ('"0.6"', '"0.5"', {(ERROR, "version")}),
+        ("<osm", "<gpx", {(ERROR, None)}),
+        ('<node id="1"', "<node", {(ERROR, None)}),
+        ('<node id="1"', '<node id="x"', {(ERROR, None)}),
+        (' lat="53" lon="-0.5"', "", {(ERROR, None)}),
+        (' lat="53" lon="-0.5"', ' action="delete"', set()),
+        ('<node id="1" version="1"', '<node id="1"', {(WARNING, None)}),
+        ('ref="2"', 'ref="3"', {(WARNING, None)}),
+        ('<way id="1" version="1"', '<way id="-1"', {(WARNING, None)}),
+        ('<node id="2"', '<node id="1"', {(WARNING, None)}),
+        ("<bounds/>", '<way id="9" version="1"/>', {(WARNING, None)}),
+        (
+            '<node id="2" version="1"',
+            '<node id="2" version="1" lat="1" lon="1"/><node id="1" version="1"',
+            {(WARNING, None)},
+        ),
+    ],
+)
+def test_osm(old: str, new: str, expected: Found) -> None:
+    text = OSM.replace(old, new, 1) if old else OSM
+    text = text.replace("</osm>", "</gpx>") if "gpx" in new else text
+    assert found("osm", {"a.osm": text.encode()}) == expected
+    assert found("osm", {"a.osm.gz": gzip.compress(text.encode())}) == expected
+
+
+# --- datum.yaml ---------------------------------------------------------------------------------------------------
+DATUM = """datum_latitude: 53.25
+datum_longitude: -0.5
+gnss_fence: {gnss_fence_coords: [[53.1, -0.5], [53.2, -0.5], [53.2, -0.4]]}
+gmapping: {xmin: -1, xmax: 1, ymin: 1, ymax: -1}
+navsat_transform_node: {wait_for_datum: true, datum: [53.25, -0.5, 0.0]}
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("", "", set()),
+        ("datum_latitude: 53.25", "", {(ERROR, "datum_latitude")}),
+        ("datum_latitude: 53.25", "datum_latitude: 153.25", {(ERROR, "datum_latitude")}),
+        ("[53.1, -0.5], ", "", {(ERROR, "gnss_fence.gnss_fence_coords")}),
+        ("[53.1, -0.5]", "[-0.5, 253.1]", {(ERROR, "gnss_fence.gnss_fence_coords")}),
+        ("gnss_fence: ", "fence: ", {(WARNING, "gnss_fence")}),
+        ("xmin: -1, ", "", {(ERROR, "gmapping")}),
+        ("datum: [53.25, -0.5, 0.0]", "datum: [53.25, -0.5]", {(ERROR, "navsat_transform_node.datum")}),
+        ("datum: [53.25, -0.5, 0.0]", "datum: [53.25, -0.5, 0]", {(WARNING, "navsat_transform_node.datum")}),
+        ("datum: [53.25, -0.5, 0.0]", "datum: [53.26, -0.5, 0.0]", {(WARNING, "navsat_transform_node.datum")}),
+        (", datum: [53.25, -0.5, 0.0]", "", {(WARNING, "navsat_transform_node.datum")}),
+    ],
+)
+def test_datum(old: str, new: str, expected: Found) -> None:
+    assert found("datum", {"datum.yaml": DATUM.replace(old, new, 1).encode()}) == expected
+
+
+# --- all of them --------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("name", "files"), CASES)
+def test_a_check_of_damaged_files_ends_in_findings(name: str, files: dict[str, bytes]) -> None:
+    """Whatever the bytes are, there is no crash; what cannot be parsed is an error."""
+    known = formats.get_format(name)
+    if known.check is None:
+        pytest.skip("no rules yet")
+    for victim, data in files.items():
+        for damaged in mutations(data, seed=len(victim)):
+            for problem in formats.check(known, {**files, victim: damaged}):
+                assert problem.level in (ERROR, WARNING)
+                assert problem.file

@@ -1,0 +1,68 @@
+"""What the readers of a datum.yaml want: the environment_template's tools, mapviz and robot_localization.
+
+Sources: LCAS/environment_common (templating/datum.py and its converters: they look up datum_latitude, datum_longitude,
+gnss_fence.gnss_fence_coords, gmapping), navsat_transform.cpp (``datum``: three decimals), rcl_yaml_param_parser (values
+of one list must be of one type).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from app.errors import Problem
+from app.formats import Files, _yaml
+from app.formats._rules import LIMITS, doubted, is_number, numbers, refused, shown
+
+SIZES = ("xmin", "xmax", "ymin", "ymax")
+SAME_DEGREES = 1e-9
+
+
+def check(files: Files) -> Iterator[Problem]:
+    """A site's datum as its readers look it up."""
+    main = next(iter(files))
+    top = _yaml.load(files[main], LIMITS)
+    if not isinstance(top, dict):
+        yield refused("a datum is a mapping", main)
+        return
+    place: dict[str, Any] = {}
+    for key, most in (("datum_latitude", 90.0), ("datum_longitude", 180.0)):
+        value = top.get(key)
+        if not is_number(value) or abs(value) > most:
+            yield refused(f"must be degrees within ±{most:g}, is {shown(value)}", main, where=key)
+        else:
+            place[key] = value
+    fence = top.get("gnss_fence")
+    corners = fence.get("gnss_fence_coords") if isinstance(fence, dict) else None
+    if corners is None:
+        yield doubted("the environment_template's tools draw the map from the fence", main, where="gnss_fence")
+    elif not isinstance(corners, list) or len(corners) < 3 or not all(numbers(c, 2, 3) for c in corners):
+        reason = "must be a list of three corners [latitude, longitude] or more"
+        yield refused(reason, main, where="gnss_fence.gnss_fence_coords")
+    elif any(abs(c[0]) > 90.0 or abs(c[1]) > 180.0 for c in corners):
+        reason = "a corner is no [latitude, longitude] in degrees"
+        yield refused(reason, main, where="gnss_fence.gnss_fence_coords")
+    size = top.get("gmapping")
+    if size is not None and not (isinstance(size, dict) and all(is_number(size.get(w)) for w in SIZES)):
+        yield refused(f"needs the numbers {', '.join(SIZES)}", main, where="gmapping")
+    yield from _navsat(top.get("navsat_transform_node"), place, main)
+
+
+def _navsat(said: Any, place: dict[str, Any], main: str) -> Iterator[Problem]:
+    where = "navsat_transform_node.datum"
+    if said is None:
+        return
+    datum = said.get("datum") if isinstance(said, dict) else None
+    if datum is None:
+        if isinstance(said, dict) and said.get("wait_for_datum"):
+            yield doubted("robot_localization waits for a datum that is not there", main, where=where)
+        return
+    if not numbers(datum, 3, 3):
+        yield refused(f"must be [latitude, longitude, yaw], is {shown(datum)}", main, where=where)
+        return
+    if len({type(v) for v in datum}) > 1:
+        yield doubted(f"ROS 2 wants values of one type in a list: write 0.0 for 0 in {shown(datum)}", main, where=where)
+    for value, key in zip(datum, ("datum_latitude", "datum_longitude"), strict=False):
+        if key in place and abs(value - place[key]) > SAME_DEGREES:
+            yield doubted(f"differs from {key} {place[key]!r}", main, where=where)
+            break

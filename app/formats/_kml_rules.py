@@ -1,0 +1,85 @@
+"""What Google Earth, GDAL and other readers want of a KML or KMZ.
+
+Sources: OGC 12-007r2 (KML 2.3: ids are XML ids; coordinates are longitude, latitude; a style is found by its id), the
+KMZ rules of Google's reference (the first .kml is the document; references are relative to it).
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from collections.abc import Collection, Iterator, Mapping
+
+from lxml import etree
+
+from app.errors import Problem
+from app.formats import Files, _archive, _xml
+from app.formats._rules import HEAD, LIMITS, brief, doubted, names, refused, repeated
+
+SPACES = ("http://www.opengis.net/kml/", "http://earth.google.com/kml/")
+
+PARTS = ("Document", "Folder", "Placemark", "GroundOverlay", "NetworkLink", "ScreenOverlay", "PhotoOverlay", "Tour")
+"""Features: Google's reader takes them for a document, others want <kml> around them."""
+
+
+def check(files: Files) -> Iterator[Problem]:
+    """A drawing as its readers take it."""
+    main = next(iter(files))
+    yield from _document(files[main], main, None)
+
+
+def check_archive(files: Files) -> Iterator[Problem]:
+    """An archive with a drawing and what it refers to."""
+    main = next(iter(files))
+    entries: Mapping[str, bytes] = _archive.unpack(files[main], LIMITS)
+    kml = [name for name in entries if name.lower().endswith(".kml")]
+    if not kml:
+        yield refused("there is no .kml in the archive", main)
+        return
+    if len(kml) > 1:
+        yield doubted(f"has {len(kml)} .kml; readers take the first one, {kml[0]}", main)
+    folder = posixpath.dirname(kml[0])
+    known = {posixpath.relpath(name, folder) if folder else name for name in entries}
+    yield from _document(entries[kml[0]], main, known)
+
+
+def _document(data: bytes, main: str, entries: Collection[str] | None) -> Iterator[Problem]:
+    if brief(data):
+        if not re.search(rb"<(\w+:)?kml\b[^>]*opengis\.net/kml|<(\w+:)?kml\b[^>]*earth\.google\.com/kml", data[:HEAD]):
+            yield refused("the root is not <kml> in its namespace", main)
+        return
+    root = _xml.parse(data, LIMITS)
+    name = etree.QName(root)
+    if name.localname != "kml":
+        one = refused if name.localname not in PARTS else doubted
+        yield one(f"the root is <{name.localname}>, not <kml>", main, line=root.sourceline)
+    elif not (name.namespace or "").startswith(SPACES):
+        yield doubted("the root is in no KML namespace: GDAL does not take it for KML", main, line=root.sourceline)
+    ids = [str(i) for i in root.xpath("//@*[local-name() = 'id']")]
+    if again := repeated(ids):
+        yield doubted(f"{len(again)} ids are given twice; styles and updates are found by them: {names(again)}", main)
+    known = set(ids)
+    urls = {(e.text or "").strip() for e in root.iter("{*}styleUrl")}
+    if lost := sorted(u for u in urls if u.startswith("#") and u[1:] not in known):
+        yield doubted(f"{len(lost)} styles are not there: {names(lost)}", main)
+    wrong = [e.sourceline for e in root.iter("{*}coordinates") if not _on_earth(e.text)]
+    if wrong:
+        reason = f"{len(wrong)} coordinates do not begin with a longitude and a latitude; the first is on this line"
+        yield refused(reason, main, line=wrong[0])
+    if entries is not None:
+        hrefs = {(e.text or "").strip() for e in root.iter("{*}href")}
+        inside = {h.partition("#")[0] for h in hrefs if h and ":" not in h and not h.startswith("#")}
+        if lost := sorted(h for h in inside if h and posixpath.normpath(h) not in entries):
+            yield doubted(f"{len(lost)} files that it refers to are not in the archive: {names(lost)}", main)
+
+
+def _on_earth(text: str | None) -> bool:
+    """Whether the first position, if there is one, is degrees within bounds."""
+    first = (text or "").split(None, 1)[:1]
+    if not first:
+        return True
+    parts = first[0].split(",")
+    try:
+        return len(parts) > 1 and abs(float(parts[0])) <= 180.0 and (not parts[1] or abs(float(parts[1])) <= 90.0)
+    except ValueError:
+        return False

@@ -1,0 +1,110 @@
+"""What the Layout Interchange Format's specification requires.
+
+Source: VDMA LIF 1.0.0, section 8 (members and their types, ids unique within the file, angles in radians from -π to π);
+the drafts of 2.0 call vehicle types mobile robot types and put layouts into origins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import orjson
+
+from app.errors import Problem
+from app.formats import Files
+from app.formats._rules import doubted, is_number, mappings, missing, names, refused, repeated, shown
+
+META = ("projectIdentification", "creator", "exportTimestamp", "lifVersion")
+ORIENTATIONS = ("GLOBAL", "TANGENTIAL")
+
+
+def check(files: Files) -> Iterator[Problem]:
+    """A file against the specification."""
+    main = next(iter(files))
+    top = orjson.loads(files[main])
+    if not isinstance(top, dict):
+        yield refused("a LIF is one JSON object", main)
+        return
+    meta = top.get("metaInformation")
+    draft = isinstance(meta, dict) and str(meta.get("lifVersion", "")).startswith("2")
+    if lost := missing(meta, META[1:] if draft else META):
+        yield refused(f"the specification requires {', '.join(lost)}", main, where="metaInformation")
+    layouts = top.get("layouts")
+    path = "layouts"
+    if layouts is None and isinstance(top.get("origins"), list):
+        layouts = [lay for _, o in mappings(top["origins"]) for _, lay in mappings(o.get("layouts"))]
+        path = "origins[].layouts"
+    if not isinstance(layouts, list):
+        yield refused("the specification requires an array of layouts", main, where="layouts")
+        return
+    ids: dict[str, list[str]] = {"nodeId": [], "edgeId": [], "stationId": [], "layoutId": []}
+    ends: list[tuple[str, list[Any]]] = []
+    for k, layout in mappings(layouts):
+        where = f"{path}[{k}]"
+        for key in missing(layout, ("layoutId", "nodes")):
+            yield refused("the specification requires it", main, where=f"{where}.{key}")
+        for key in missing(layout, ("layoutVersion", "edges", "stations")):
+            yield doubted("the specification requires it", main, where=f"{where}.{key}")
+        ids["layoutId"].append(str(layout.get("layoutId")))
+        yield from _items(layout, ids, ends, main, where)
+    for key, found in ids.items():
+        if again := repeated(found):
+            yield refused(f"{len(again)} are not unique within the file: {names(again)}", main, where=key)
+    known = set(ids["nodeId"])
+    if lost := [item for item, refs in ends if not all(isinstance(r, str) and r in known for r in refs)]:
+        reason = f"{len(lost)} edges or stations name a node that is not there: {names(lost)}"
+        yield refused(reason, main, where=path)
+
+
+def _items(
+    layout: dict[str, Any], ids: dict[str, list[str]], ends: list[tuple[str, list[Any]]], main: str, where: str
+) -> Iterator[Problem]:
+    for k, node in mappings(layout.get("nodes")):
+        place = f"{where}.nodes[{k}]"
+        at = node.get("nodePosition")
+        if not isinstance(node.get("nodeId"), str):
+            yield refused("a node needs a nodeId", main, where=place)
+        if not isinstance(at, dict) or not (is_number(at.get("x")) and is_number(at.get("y"))):
+            yield refused("a node needs a nodePosition with x and y", main, where=place)
+        ids["nodeId"].append(str(node.get("nodeId")))
+        yield from _vehicles(node, "NodeProperties", main, place)
+    for k, edge in mappings(layout.get("edges")):
+        place = f"{where}.edges[{k}]"
+        if lost := missing(edge, ("edgeId", "startNodeId", "endNodeId")):
+            yield refused(f"an edge needs {', '.join(lost)}", main, where=place)
+        ids["edgeId"].append(str(edge.get("edgeId")))
+        ends.append((str(edge.get("edgeId")), [edge.get("startNodeId"), edge.get("endNodeId")]))
+        yield from _vehicles(edge, "EdgeProperties", main, place)
+    for k, station in mappings(layout.get("stations")):
+        place = f"{where}.stations[{k}]"
+        refs = station.get("interactionNodeIds")
+        if not isinstance(station.get("stationId"), str) or not isinstance(refs, list):
+            yield refused("a station needs a stationId and interactionNodeIds", main, where=place)
+            continue
+        ids["stationId"].append(station["stationId"])
+        ends.append((station["stationId"], refs))
+
+
+def _vehicles(item: dict[str, Any], end: str, main: str, where: str) -> Iterator[Problem]:
+    key, word = next(
+        ((f"{w}{end}", w) for w in ("vehicleType", "mobileRobotType") if f"{w}{end}" in item), (f"vehicleType{end}", "")
+    )
+    said = item.get(key)
+    if not isinstance(said, list) or not said:
+        yield refused("needs an entry for one type of vehicle at least", main, where=f"{where}.{key}")
+        return
+    for k, one in enumerate(said):
+        place = f"{where}.{key}[{k}]"
+        if len(missing(one, (f"{word}Id", f"{word}s"))) > 1:
+            yield refused(f"needs a {word}Id", main, where=place)
+            continue
+        theta = one.get("theta")
+        if theta is not None and not is_number(theta):
+            yield refused(f"must be a number, is {shown(theta)}", main, where=f"{place}.theta")
+        elif theta is not None and abs(theta) > math.pi + 1e-6:
+            yield doubted(f"{theta:g} is no angle in radians from -π to π", main, where=f"{place}.theta")
+        if one.get("orientationType") not in (None, *ORIENTATIONS):
+            reason = f"must be one of {', '.join(ORIENTATIONS)}, is {shown(one['orientationType'])}"
+            yield refused(reason, main, where=f"{place}.orientationType")

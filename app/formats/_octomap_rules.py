@@ -1,0 +1,96 @@
+"""What the OctoMap library wants of a file.
+
+Source: OctoMap, AbstractOcTree::read (first line, ``id``, ``size``, ``res``, ``data``; an unknown id is refused),
+AbstractOccupancyOcTree::readBinary (size and number of nodes are compared), OcTreeKey (16 levels).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Iterator
+
+import numpy as np
+
+from app.errors import Problem
+from app.formats import Files
+from app.formats._rules import doubted, refused, shown
+
+BINARY, FULL = b"# Octomap OcTree binary file", b"# Octomap OcTree file"
+NODE_BYTES = {"OcTree": 5, "ColorOcTree": 8, "OcTreeStamped": 5}
+HEAD = 2**16
+MOST_CELLS = 65536
+_KEYS = re.compile(rb"^(id|size|res)[ \t]+([^\r\n]*?)[ \t]*\r?$", re.MULTILINE)
+
+_codes = np.arange(65536)
+_CHILDREN = sum(((_codes >> shift) & 3 > 0).astype(np.uint8) for shift in range(0, 16, 2))
+_INNER = sum(((_codes >> shift) & 3 == 3).astype(np.uint8) for shift in range(0, 16, 2))
+"""Of the 16 bits of an inner node: how many children it has, and how many of these are inner nodes."""
+
+
+def check(files: Files) -> Iterator[Problem]:
+    """A file's header against what follows it; the tree is counted, not built."""
+    main = next(iter(files))
+    data = files[main]
+    if data[:4] == b"\x03\0\0\0":
+        reason = "the headerless form of 2010: newer tools do not read it; ask for .bt or .ot anew"
+        yield doubted(reason, main)
+        _, resolution, size = struct.unpack("<IdI", data[:16])
+        yield from _binary(data[16:], size, main)
+        yield from _resolution(resolution, main)
+        return
+    kind = next((k for k in (BINARY, FULL) if data.startswith(k)), None)
+    start = re.search(rb"^data[ \t]*\r?\n", data[:HEAD], re.MULTILINE)
+    if kind is None or start is None:
+        reason = "the first line must be '# Octomap OcTree file' or '… binary file', and a line 'data' end the header"
+        yield refused(reason, main, line=1)
+        return
+    said = {key.decode(): value.decode("latin1") for key, value in _KEYS.findall(data[: start.start()])}
+    tree, size, res = said.get("id"), said.get("size"), said.get("res")
+    if tree not in NODE_BYTES:
+        yield refused(f"octomap itself knows no tree of the type {shown(tree)}", main, where="id")
+    if size is None or not size.isdigit():
+        yield refused(f"must be the number of nodes, is {shown(size)}", main, where="size")
+    try:
+        yield from _resolution(float(res or "nan"), main)
+    except ValueError:
+        yield refused(f"must be a number, is {shown(res)}", main, where="res")
+    body = data[start.end() :]
+    count = int(size) if size is not None and size.isdigit() else None
+    if kind == BINARY:
+        yield from _binary(body, count, main)
+    elif tree in NODE_BYTES and count is not None:
+        need = count * NODE_BYTES[tree]
+        if len(body) < need:
+            yield refused(f"{count} nodes are {need} bytes; the file has {len(body)}", main, where="size")
+        elif len(body) > need:
+            yield doubted(f"{len(body) - need} bytes follow the last node", main, where="size")
+
+
+def _resolution(value: float, main: str) -> Iterator[Problem]:
+    if not math.isfinite(value) or value <= 0:
+        yield refused(f"must be a length above 0, is {value:g}", main, where="res")
+
+
+def _binary(body: bytes, count: int | None, main: str) -> Iterator[Problem]:
+    """Two bits for each child: the nodes that are told of, and the inner nodes that must follow."""
+    if not count and not body:
+        return
+    words = np.frombuffer(body, "<u2", len(body) // 2)
+    assert isinstance(_INNER, np.ndarray)
+    assert isinstance(_CHILDREN, np.ndarray)
+    # Depth first, the stream ends where no inner node is open any more.
+    open_nodes = 1 + np.cumsum(_INNER[words].astype(np.int64) - 1)
+    ends = np.flatnonzero(open_nodes == 0)
+    if not len(ends):
+        yield refused("it is cut short: an inner node's children are missing", main)
+        return
+    used = int(ends[0]) + 1
+    if used < len(words):
+        yield doubted(f"{len(body) - 2 * used} bytes follow the tree", main)
+    nodes = 1 + int(_CHILDREN[words[:used]].sum(dtype=np.int64))
+    if count is not None and nodes != count:
+        yield doubted(
+            f"the header says {count} nodes, the tree has {nodes}: octomap tells an error", main, where="size"
+        )

@@ -1,0 +1,228 @@
+"""What Open-RMF's building_map_generator and traffic editor want of a building.yaml.
+
+Source: open-rmf/rmf_traffic_editor, rmf_building_map_tools/building_map (building.py, level.py, edge.py, vertex.py,
+param_value.py, lift.py, transform.py); the traffic editor (C++) converts parameters to the type that they say.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from app.errors import Problem
+from app.formats import Files, _yaml
+from app.formats._rules import (
+    LARGEST,
+    LIMITS,
+    brief,
+    doubted,
+    is_number,
+    mappings,
+    missing,
+    names,
+    numbers,
+    refused,
+    repeated,
+    shown,
+)
+
+SYSTEMS = ("reference_image", "web_mercator", "cartesian_meters", "wgs84")
+KINDS: Mapping[int, type | tuple[type, ...]] = {1: (str, int, float), 2: int, 3: (int, float), 4: bool}
+EDGES = ("lanes", "walls", "doors", "measurements", "human_lanes")
+DOORS = ("sliding", "hinged", "double_sliding", "double_hinged")
+DOOR = ("door_type", "x", "y", "motion_axis_orientation", "width")
+LIFT = ("depth", "width", "yaw", "x", "y")
+GRAPHS = 9
+EASTING_FIRST = re.compile(r"\s*EPSG:\s*(32[67]\d\d|258\d\d|27700|2154|3857)\s*", re.IGNORECASE)
+"""UTM on WGS 84 and ETRS 89, and others in use, of which PROJ gives the easting first."""
+
+
+def check(files: Files) -> Iterator[Problem]:
+    """A building as its generator and its editor load it."""
+    main = next(iter(files))
+    if brief(files[main]):
+        return
+    if len(files[main]) > LARGEST:
+        yield doubted(f"not checked: it is larger than {LARGEST} bytes", main)
+        return
+    top = _yaml.load(files[main], LIMITS)
+    if not isinstance(top, dict):
+        yield refused("a building is a mapping", main)
+        return
+    if top.get("name") is None and top.get("building_name") is None:
+        yield refused("a building needs a name", main, where="name")
+    system = top.get("coordinate_system", SYSTEMS[0])
+    if system not in SYSTEMS:
+        yield refused(f"must be one of {', '.join(SYSTEMS)}, is {shown(system)}", main, where="coordinate_system")
+    yield from _parameters(top.get("parameters"), main, "parameters")
+    levels = top.get("levels")
+    if not isinstance(levels, dict) or not levels:
+        yield refused("a building needs one level at least", main, where="levels")
+        return
+    reference = top.get("reference_level_name", next(iter(levels)))
+    if reference not in levels:
+        yield refused(f"there is no level {shown(reference)}", main, where="reference_level_name")
+    for name, level in levels.items():
+        if isinstance(level, dict):
+            yield from _level(level, main, f"levels.{name}", files, measured=system == SYSTEMS[0] and name == reference)
+        else:
+            yield refused("must be a mapping", main, where=f"levels.{name}")
+    if system == SYSTEMS[0] and isinstance(levels.get(reference), dict):
+        yield from _aligned(levels, reference, main)
+    yield from _on_earth(top, str(system), levels, main)
+    lifts = top.get("lifts")
+    for name, lift in lifts.items() if isinstance(lifts, dict) else ():
+        yield from _lift(lift, levels, main, f"lifts.{name}")
+
+
+def _parameters(said: Any, main: str, where: str) -> Iterator[Problem]:
+    """Typed parameters: [type, value]."""
+    if not said:
+        return
+    if not isinstance(said, dict):
+        yield refused(f"must be a mapping, is {shown(said)}", main, where=where)
+        return
+    for key, value in said.items():
+        place = f"{where}.{key}"
+        if not isinstance(value, list) or len(value) != 2 or value[0] not in KINDS or isinstance(value[0], bool):
+            reason = f"must be [type, value] (1 text, 2 integer, 3 decimal, 4 truth value), is {shown(value)}"
+            yield refused(reason, main, where=place)
+        elif not isinstance(value[1], KINDS[value[0]]) or (value[0] in (2, 3) and isinstance(value[1], bool)):
+            yield refused(f"the value {shown(value[1])} is not of its type {value[0]}", main, where=place)
+
+
+def _level(level: dict[str, Any], main: str, where: str, files: Files, *, measured: bool) -> Iterator[Problem]:
+    drawing = level.get("drawing")
+    if drawing is not None:
+        image = drawing.get("filename") if isinstance(drawing, dict) else None
+        if not isinstance(image, str):
+            yield refused("a drawing needs a filename", main, where=f"{where}.drawing")
+        elif image and posixpath.normpath(posixpath.join(posixpath.dirname(main), image)) not in files:
+            yield doubted(f"the drawing {shown(image)} is not there", main, where=f"{where}.drawing.filename")
+    if "elevation" in level and not is_number(level["elevation"]):
+        yield refused(f"must be a number, is {shown(level['elevation'])}", main, where=f"{where}.elevation")
+    vertices = level.get("vertices") or []
+    if not isinstance(vertices, list):
+        yield refused("must be a list", main, where=f"{where}.vertices")
+        return
+    for k, row in enumerate(vertices):
+        if not isinstance(row, list) or len(row) < 4 or not numbers(row[:3], 3):
+            yield refused("a vertex is [x, y, z, name, {…}]", main, where=f"{where}.vertices[{k}]")
+        elif len(row) > 4:
+            yield from _parameters(row[4], main, f"{where}.vertices[{k}]")
+    called = [
+        row[3] for row in vertices if isinstance(row, list) and len(row) > 3 and isinstance(row[3], str) and row[3]
+    ]
+    if again := repeated(called):
+        reason = f"{len(again)} names are given to several vertices; fleet adapters refuse that: {names(again)}"
+        yield doubted(reason, main, where=f"{where}.vertices")
+    for word in EDGES:
+        yield from _edges(level.get(word), word, vertices, main, f"{where}.{word}")
+    if measured and not level.get("measurements"):
+        reason = "the reference level has no measurement: a pixel counts as a metre"
+        yield doubted(reason, main, where=f"{where}.measurements")
+    for word in ("floors", "holes"):
+        for k, area in mappings(level.get(word)):
+            ring = area.get("vertices")
+            if not isinstance(ring, list) or len(ring) < 3 or not all(_is_index(i, vertices) for i in ring):
+                yield refused("needs three vertices or more that are there", main, where=f"{where}.{word}[{k}]")
+    for k, row in enumerate(level.get("fiducials") or ()):
+        if not isinstance(row, list) or len(row) < 3 or not numbers(row[:2], 2):
+            yield refused("a fiducial is [x, y, name]", main, where=f"{where}.fiducials[{k}]")
+
+
+def _is_index(value: Any, vertices: list[Any]) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < len(vertices)
+
+
+def _edges(rows: Any, word: str, vertices: list[Any], main: str, where: str) -> Iterator[Problem]:
+    if not rows:
+        return
+    if not isinstance(rows, list):
+        yield refused("must be a list", main, where=where)
+        return
+    for k, row in enumerate(rows):
+        place = f"{where}[{k}]"
+        if not isinstance(row, list) or len(row) < 2 or not all(_is_index(i, vertices) for i in row[:2]):
+            yield refused(f"must be [i, j, {{…}}] with vertices below {len(vertices)}", main, where=place)
+            continue
+        said = row[2] if len(row) > 2 and isinstance(row[2], dict) else {}
+        yield from _parameters(row[2] if len(row) > 2 else None, main, place)
+        value = {key: v[1] for key, v in said.items() if isinstance(v, list) and len(v) == 2}
+        if word == "measurements":
+            if not is_number(value.get("distance")):
+                yield refused("a measurement needs a distance", main, where=place)
+            a, b = vertices[row[0]], vertices[row[1]]
+            if isinstance(a, list) and isinstance(b, list) and a[:2] == b[:2]:
+                yield refused("a measurement of length 0: the scale is a division by it", main, where=place)
+        elif word == "doors":
+            if lost := [key for key in ("name", "type") if value.get(key) is None]:
+                yield refused(f"a door needs {' and '.join(lost)}", main, where=place)
+            elif value["type"] not in DOORS:
+                yield doubted(f"the generator has no door of the type {shown(value['type'])}", main, where=place)
+        elif word == "lanes" and value.get("graph_idx", 0) not in range(GRAPHS):
+            reason = f"only graphs 0 to {GRAPHS - 1} are generated; this lane is of {shown(value['graph_idx'])}"
+            yield doubted(reason, main, where=place)
+
+
+def _aligned(levels: Mapping[str, Any], reference: str, main: str) -> Iterator[Problem]:
+    """Levels of drawings come to the reference level's place by two fiducials of the same names."""
+
+    def marks(level: Any) -> set[str]:
+        rows = level.get("fiducials") if isinstance(level, dict) else None
+        return {str(row[2]) for row in rows or () if isinstance(row, list) and len(row) > 2}
+
+    for name, level in levels.items():
+        common = marks(level) & marks(levels[reference])
+        if name != reference and len(common) < 2:
+            reason = f"it shares {len(common)} fiducials with {reference}; two bring its drawing to the right place"
+            yield doubted(reason, main, where=f"levels.{name}.fiducials")
+
+
+def _on_earth(top: Mapping[str, Any], system: str, levels: Mapping[str, Any], main: str) -> Iterator[Problem]:
+    said = top.get("parameters") if isinstance(top.get("parameters"), dict) else {}
+    assert isinstance(said, dict)
+    value = {key: v[1] for key, v in said.items() if isinstance(v, list) and len(v) == 2}
+    crs = value.get("generate_crs")
+    if system in ("web_mercator", "wgs84") and not crs:
+        yield refused(f"{system} needs the parameter generate_crs", main, where="parameters.generate_crs")
+    if system == "wgs84":
+        for key in ("suggested_offset_x", "suggested_offset_y"):
+            if value.get(key) is None:
+                yield refused(f"wgs84 needs the parameter {key}", main, where=f"parameters.{key}")
+        if isinstance(crs, str) and EASTING_FIRST.fullmatch(crs):
+            reason = (
+                f"{crs} gives the easting first and the generator takes the northing first: x and y come out swapped"
+            )
+            yield doubted(reason, main, where="parameters.generate_crs")
+    if system == "web_mercator":
+        origin = value.get("generate_origin_vertex", "origin")
+        rows = [row for lv in levels.values() if isinstance(lv, dict) for row in lv.get("vertices") or ()]
+        if not any(isinstance(row, list) and len(row) > 3 and row[3] == origin for row in rows):
+            reason = f"no vertex is called {shown(origin)}: the map keeps its origin at 0° N 0° E"
+            yield doubted(reason, main, where="parameters.generate_origin_vertex")
+
+
+def _lift(lift: Any, levels: Mapping[str, Any], main: str, where: str) -> Iterator[Problem]:
+    if not isinstance(lift, dict):
+        yield refused("must be a mapping", main, where=where)
+        return
+    if lost := [key for key in LIFT if not is_number(lift.get(key))]:
+        yield refused(f"a lift needs the numbers {', '.join(lost)}", main, where=where)
+    for key in ("reference_floor_name", "highest_floor", "lowest_floor"):
+        floor = lift.get(key)
+        if (floor or (key == "reference_floor_name" and floor is not None)) and floor not in levels:
+            yield refused(f"there is no level {shown(floor)}", main, where=f"{where}.{key}")
+    doors = lift.get("doors")
+    for name, door in doors.items() if isinstance(doors, dict) else ():
+        if lost := missing(door, DOOR):
+            yield refused(f"a lift door needs {', '.join(lost)}", main, where=f"{where}.doors.{name}")
+    stops = lift.get("level_doors")
+    for floor, listed in stops.items() if isinstance(stops, dict) else ():
+        if floor not in levels:
+            yield refused(f"there is no level {shown(floor)}", main, where=f"{where}.level_doors")
+        lost = [d for d in listed if d not in (doors or {})] if isinstance(listed, list) else []
+        if lost:
+            yield doubted(f"the lift has no door {names(lost)}", main, where=f"{where}.level_doors.{floor}")

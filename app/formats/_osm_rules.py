@@ -1,0 +1,115 @@
+"""What osmium, GDAL, JOSM and editors of OpenStreetMap want of an OSM XML file.
+
+Sources: libosmium's XML input (``version`` 0.6, nodes, ways, relations), osmium-tool's manual (files are sorted by type
+and id; ids and versions are positive in data of the database), GDAL's OSM driver (negative ids need
+OSM_USE_CUSTOM_INDEXING=NO; nodes before ways before relations), the OSM API 0.6.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from lxml import etree
+
+from app.errors import Problem
+from app.formats import Files, _osm, _xml
+from app.formats._rules import HEAD, LIMITS, brief, doubted, names, refused, repeated
+
+KINDS = ("node", "way", "relation")
+MOST_NODES = 2000
+"""Of a way: the API's limit."""
+
+
+def check(files: Files) -> Iterator[Problem]:
+    """An XML file (also packed) as its readers take it; a .pbf has its own strict layout and is left alone."""
+    main = next(iter(files))
+    if _osm.is_pbf(files[main]):
+        return
+    if brief(files[main]):
+        if not re.search(rb"""<osm\b[^>]*\bversion=["']0\.6["']""", files[main][:HEAD]):
+            yield refused("must be 0.6", main, where="version")
+        return
+    root = _xml.parse(_osm.unpack(files[main], LIMITS), LIMITS)
+    if root.tag not in ("osm", "osmChange"):
+        yield refused(f"the root is <{root.tag}>, not <osm>", main, line=root.sourceline)
+        return
+    if root.get("version") != "0.6":
+        yield refused(f"must be 0.6, is {root.get('version')!r}", main, line=root.sourceline, where="version")
+    found = _Found()
+    try:
+        found.take(root)
+    except (TypeError, ValueError):
+        yield refused("an id or a ref is missing or no whole number", main, line=found.line)
+        return
+    for kind, ids in found.ids.items():
+        if again := repeated(ids):
+            yield doubted(f"{len(again)} ids are given to several {kind}s: {names(again)}", main)
+        if new := [i for i in ids if i < 0]:
+            reason = (
+                f"{len(new)} {kind}s have negative ids, as JOSM gives them to what is new: GDAL reads them with "
+                "OSM_USE_CUSTOM_INDEXING=NO"
+            )
+            yield doubted(reason, main)
+        if bare := found.bare[kind]:
+            yield doubted(f"{bare} {kind}s have no version from 1: osmium's merging of changes needs them", main)
+    if found.nowhere:
+        yield refused(f"{len(found.nowhere)} nodes have no place: {names(found.nowhere)}", main)
+    if absent := sorted(found.refs - set(found.ids["node"])):
+        yield doubted(f"{len(absent)} nodes of ways are not in the file: {names(absent)}", main)
+    if found.long:
+        yield doubted(f"{len(found.long)} ways have more than {MOST_NODES} nodes: {names(found.long)}", main)
+    if root.tag == "osm":
+        yield from _order(found, main)
+
+
+@dataclass(slots=True)
+class _Found:
+    """What one walk through the elements found. kinds: in the order in which they stand, each run once."""
+
+    ids: dict[str, list[int]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
+    bare: Counter[str] = field(default_factory=Counter)
+    refs: set[int] = field(default_factory=set)
+    nowhere: list[int] = field(default_factory=list)
+    long: list[int] = field(default_factory=list)
+    kinds: list[str] = field(default_factory=list)
+    line: int | None = None
+
+    def take(self, parent: etree._Element) -> None:
+        """All elements below; a change file has blocks of them. TypeError or ValueError for what is no number."""
+        for element in parent:
+            kind = element.tag
+            if kind not in self.ids:
+                if kind in ("create", "modify", "delete"):
+                    self.take(element)
+                continue
+            said = element.attrib
+            self.line = element.sourceline
+            i = int(str(said["id"]) if "id" in said else "")
+            self.ids[str(kind)].append(i)
+            if not self.kinds or self.kinds[-1] != kind:
+                self.kinds.append(str(kind))
+            if i > 0 and not str(said.get("version", "")).isdigit():
+                self.bare[str(kind)] += 1
+            if kind == "node":
+                gone = said.get("action") == "delete" or said.get("visible") == "false" or parent.tag == "delete"
+                if not gone and ("lat" not in said or "lon" not in said):
+                    self.nowhere.append(i)
+            elif kind == "way":
+                refs = [int(nd.get("ref", "")) for nd in element.iterchildren("nd")]
+                self.refs.update(refs)
+                if len(refs) > MOST_NODES:
+                    self.long.append(i)
+
+
+def _order(found: _Found, main: str) -> Iterator[Problem]:
+    if found.kinds != [kind for kind in KINDS if kind in found.kinds]:
+        yield doubted("types are mixed: GDAL and osmium want all nodes, then all ways, then all relations", main)
+        return
+    for kind, ids in found.ids.items():
+        if any(b < a for a, b in pairwise(i for i in ids if i > 0)):
+            yield doubted(f"the {kind}s are not sorted by id: some of osmium's commands need `osmium sort`", main)
+            return

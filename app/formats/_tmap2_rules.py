@@ -1,0 +1,156 @@
+"""What topological_navigation wants of a tmap2.
+
+Sources: its JSON schema (config/tmap-schema.yaml); manager2.py, which addresses edges by their ``edge_id`` and gives
+them new ones of the form ``<from>_<to>`` when a node is renamed; localisation.py, which reads each node's pose.
+
+A network of a city has megabytes of YAML. Where its lines are regular, as PyYAML writes them, it is enough to count
+them; only a file in which something is missing, or that is laid out otherwise, is parsed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from app.errors import Problem
+from app.formats import Files, _yaml
+from app.formats._rules import HEAD, LIMITS, brief, doubted, missing, names, refused, repeated, shown
+
+TOP = ("meta", "metric_map", "name", "nodes", "pointset")
+META = ("map", "node", "pointset")
+NODE = ("edges", "name", "parent_frame")
+EDGE = ("edge_id", "node")
+LAST_UPDATED = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}_[0-9]{2}-[0-9]{2}-[0-9]{2}")
+
+_LINES = re.compile(rb"\n(    name|    node| {6}edge_id| {6}node): (.*)")
+_NO_TEXT = re.compile(rb"\n(?:metric_map|name|pointset): [-+.\d~]")
+_COUNTED = (
+    b"\n    map: ",
+    b"\n    node: ",
+    b"\n    pointset: ",
+    b"\n    parent_frame: ",
+    b"\n    edges:",
+    b"\n    pose:\n",
+)
+_TOPS = (b"\nmetric_map: ", b"\nname: ", b"\npointset: ")
+_TIME = re.compile(rb"""(?:^|\n)meta:\n(?:  [^\n]*\n)*?  last_updated: (['"]?)([^'"\n]*)\1\n""")
+
+Edges = list[tuple[str, str, str]]
+
+
+def check(files: Files) -> Iterator[Problem]:
+    """A map as the schema and the map manager want it."""
+    main = next(iter(files))
+    data = files[main]
+    if brief(data):
+        if not _is_dated(data[:HEAD]):
+            yield refused("must be a text like 2024-05-01_10-00-00", main, where="meta.last_updated")
+        return
+    found = _regular(data)
+    if found is None:
+        found = ([], [])
+        yield from _whole(_yaml.load(data, LIMITS), main, *found)
+    yield from _network(*found, main)
+
+
+def _regular(data: bytes) -> tuple[list[str], Edges] | None:
+    """Nodes and edges (source, id, target) of a regular file in which all is there that must be; else None."""
+    count = data.count(b"\n- meta:\n")
+    if not count or not _is_dated(data[:HEAD]) or b"&" in data:
+        return None
+    if any(data.count(line) != count for line in _COUNTED) or any(data.count(line) != 1 for line in _TOPS):
+        return None
+    if _NO_TEXT.search(data):
+        return None
+    called = b""
+    nodes: list[str] = []
+    edges: Edges = []
+    waiting: dict[bytes, list[str]] = {b"edge_id": [], b"node": []}
+    for key, value in _LINES.findall(data):
+        text = value.decode("utf-8", "replace").strip("'\"")
+        if key == b"    node":
+            called = value
+        elif key == b"    name":
+            if value != called or value[:1] in b"-+.0123456789~&*":
+                return None
+            nodes.append(text)
+            ids, targets = waiting[b"edge_id"], waiting[b"node"]
+            if len(ids) != len(targets):
+                return None
+            edges += [(text, i, target) for i, target in zip(ids, targets, strict=True)]
+            ids.clear()
+            targets.clear()
+        else:
+            waiting[key.strip()].append(text)
+    return (nodes, edges) if len(nodes) == count and not waiting[b"edge_id"] else None
+
+
+def _is_dated(head: bytes) -> bool:
+    time = _TIME.search(head)
+    return time is not None and LAST_UPDATED.fullmatch(time[2].decode("latin1")) is not None
+
+
+def _whole(top: Any, main: str, nodes: list[str], edges: Edges) -> Iterator[Problem]:
+    """The schema's rules, one by one; fills in nodes and edges."""
+    if not isinstance(top, dict):
+        yield refused("a topological map is a mapping; a list is the older tmap", main)
+        return
+    for key in missing(top, TOP):
+        yield refused("the schema requires this key", main, where=key)
+    for key in ("metric_map", "name", "pointset"):
+        if top.get(key) is not None and not isinstance(top[key], str):
+            yield refused(f"must be a text, is {shown(top[key])}", main, where=key)
+    time = top["meta"].get("last_updated") if isinstance(top.get("meta"), dict) else None
+    if not isinstance(time, str) or not LAST_UPDATED.fullmatch(time):
+        reason = f"must be a text like 2024-05-01_10-00-00, is {shown(time)}"
+        yield refused(reason, main, where="meta.last_updated")
+    rows = top.get("nodes")
+    if not isinstance(rows, list):
+        if rows is not None:
+            yield refused(f"must be a list, is {shown(rows)}", main, where="nodes")
+        return
+    for k, row in enumerate(rows):
+        where = f"nodes[{k}]"
+        meta, node = (row.get("meta"), row.get("node")) if isinstance(row, dict) else (None, None)
+        if lost := missing(meta, META):
+            yield refused(f"the schema requires {', '.join(lost)}", main, where=f"{where}.meta")
+        if lost := missing(node, NODE):
+            yield refused(f"the schema requires {', '.join(lost)}", main, where=f"{where}.node")
+        if not isinstance(node, dict):
+            continue
+        if missing(node.get("pose"), ("orientation", "position")):
+            yield refused("localisation reads the pose of each node", main, where=f"{where}.node.pose")
+        for key in ("name", "parent_frame"):
+            if node.get(key) is not None and not isinstance(node[key], str):
+                yield refused(f"must be a text, is {shown(node[key])}", main, where=f"{where}.node.{key}")
+        name = str(node.get("name"))
+        if isinstance(meta, dict) and meta.get("node") not in (None, node.get("name")):
+            yield doubted(
+                f"is {shown(meta['node'])}, and the node is called {name!r}", main, where=f"{where}.meta.node"
+            )
+        nodes.append(name)
+        listed = node.get("edges")
+        if listed is not None and not isinstance(listed, list):
+            yield refused(f"must be a list, is {shown(listed)}", main, where=f"{where}.node.edges")
+            continue
+        for j, edge in enumerate(listed or ()):
+            if lost := missing(edge, EDGE):
+                yield refused(f"the schema requires {', '.join(lost)}", main, where=f"{where}.node.edges[{j}]")
+                continue
+            edges.append((name, str(edge["edge_id"]), str(edge["node"])))
+
+
+def _network(nodes: list[str], edges: Edges, main: str) -> Iterator[Problem]:
+    known = set(nodes)
+    if again := repeated(nodes):
+        yield doubted(f"{len(again)} nodes share a name, and edges lead to names: {names(again)}", main, where="nodes")
+    if lost := [i for _, i, target in edges if target not in known]:
+        reason = f"{len(lost)} edges lead to a node that is not there: {names(lost)}"
+        yield refused(reason, main, where="nodes")
+    if again := repeated(i for _, i, _ in edges):
+        reason = f"{len(again)} edges share an edge_id, by which the map manager finds them: {names(again)}"
+        yield doubted(reason, main, where="nodes")
+    if other := [i for source, i, target in edges if i != f"{source}_{target}"]:
+        reason = f"{len(other)} edges are not called <from>_<to>, as the map manager calls them: {names(other)}"
+        yield doubted(reason, main, where="nodes")
