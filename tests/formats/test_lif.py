@@ -97,7 +97,7 @@ def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_jso
         layers, context = read(data)
         served, told = write(layers)
         assert same("lif", {path.name: data}, {"layout.lif.json": served}) == [], path
-        assert (told.dropped, told.template, told.warnings) == ([], [], [])
+        assert (told.dropped, told.template, [w for w in told.warnings if not w.level]) == ([], [], [])
         assert json.loads(served)["metaInformation"] == json.loads(data)["metaInformation"]
         assert write(read(served)[0])[0] == served
         assert ("is a draft" in warnings(context)) == ("2_0" in str(path))
@@ -163,7 +163,7 @@ def test_the_sample_in_full(same: Same) -> None:
     assert stations.geometry[1].is_empty
     served, told = write(layers)
     assert same("lif", {"a.json": data}, {"b.json": served}) == []
-    assert (told.dropped, told.template, told.warnings) == ([], [], [])
+    assert (told.dropped, told.template, [w for w in told.warnings if not w.level]) == ([], [], [])
     top = json.loads(served)
     assert [layout["layoutId"] for layout in top["layouts"]] == ["Hall", "Upstairs", "Empty"]
     assert [n["nodeId"] for n in top["layouts"][0]["nodes"]] == ["N2", "N1", "E1"]
