@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from app import formats
 from app.errors import BadUpload, Invalid, Problem, UnreadableFile
-from app.formats import Files, Group, Limits, ReadContext, _archive, _shell
+from app.formats import Files, Format, Group, Limits, ReadContext, _archive, _shell
 from app.model import network
 from app.model.features import Features, concatenate, from_columns, unique_ids
 from app.model.frame import GROUND, Datum, Level
@@ -139,7 +139,7 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits) -> Bundle:
         raise Invalid("the upload has no file: send at least one as form field 'files'")
     bundle = Bundle(files={name: Use() for name in files})
     variables = _read_variables(files, bundle)
-    groups, rest = _group({n: d for n, d in files.items() if n not in variables}, hints.format)
+    groups, rest = _group({n: d for n, d in files.items() if n not in variables}, hints)
     taken = _set_aside(groups, bundle)
     _check_options(groups, hints)
     found: list[Read] = []
@@ -157,12 +157,16 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits) -> Bundle:
         raise errors[0](details[0] if len(details) == 1 else "; ".join(details), problems)
     for name in rest:
         if files[name] and not _QUIET.search(PurePosixPath(name).name):
-            bundle.warnings.append(Problem("no format reads this file: it is kept as a source", name))
+            lacking = _lacking(name, files[name])
+            reason = "no format reads this file: it is kept as a source" + (f" ({lacking})" if lacking else "")
+            bundle.warnings.append(Problem(reason, name))
     _compete(found, bundle)
     if hints.format is None and not any(u.format for u in bundle.files.values()) and not variables:
+        lacks = {name: text for name in sorted(files) if (text := _lacking(name, files[name]))}
         known_formats = ", ".join(f.name for f in formats.all_formats().values() if f.read)
         detail = f"none of the files is a map that is known here; name the format, one of: {known_formats}"
-        raise UnreadableFile(detail, [Problem("no known map format", name) for name in sorted(files)])
+        detail += "".join(f"; {name}: {text}" for name, text in list(lacks.items())[:1])
+        raise UnreadableFile(detail, [Problem(lacks.get(n, "no known map format"), n) for n in sorted(files)])
     _choose_datum(bundle, known)
     return bundle
 
@@ -195,12 +199,43 @@ def corner(parts: Mapping[PartKey, Part]) -> Datum | None:
     return Datum(float(np.clip(south, -85.0, 85.0)), float(west))
 
 
-def _group(files: Files, format_name: str | None) -> tuple[list[Group], list[str]]:
+def _group(files: Files, hints: Hints) -> tuple[list[Group], list[str]]:
     present = {name: data for name, data in files.items() if data}
     if not present:
         raise UnreadableFile("all files are empty", [Problem("the file is empty", name) for name in sorted(files)])
-    groups, rest = formats.group(present, format_name)
+    groups, rest = formats.group(present, hints.format)
+    for known in formats.all_formats().values():
+        if hints.format in (None, known.name) and known.completing & hints.options.keys():
+            completed = _completed(known, groups, rest, present, hints.options.get("file"))
+            if completed is not None:
+                groups = [*(g for g in groups if g.main not in completed.files), completed]
+                rest = sorted(set(rest) - completed.files.keys())
     return groups, sorted({*rest, *(files.keys() - present.keys())})
+
+
+def _completed(known: Format, groups: list[Group], rest: list[str], files: Files, wanted: str | None) -> Group | None:
+    """The file that options of the upload make a map, where it says too little by itself: a picture and its place."""
+    lone = {g.main for g in groups if g.format is known and known.lacking(g.main, g.files[g.main])}
+    found = sorted(n for n in {*rest, *lone} if known.lacking(n, files[n]))
+    if wanted is not None:
+        found = [n for n in found if n == wanted or n.rpartition("/")[2] == wanted]
+        if not found:
+            raise Invalid(f"no file of the upload is called {wanted!r}", [Problem("no such file", where="file")])
+    if len(found) > 1:
+        reason = (
+            f"the options say where one picture lies, and there are several, name it with file=…: {', '.join(found)}"
+        )
+        raise Invalid(reason, [Problem(reason, where="file")])
+    if not found:
+        return None
+    main = found[0]
+    others = [n for n in known.companions(main, files[main], sorted(files)) if n in files]
+    return Group(known, main, {n: files[n] for n in [main, *others]})
+
+
+def _lacking(name: str, data: bytes) -> str:
+    """What a file would need to be a map, where a format knows it."""
+    return next((text for f in formats.all_formats().values() if data and (text := f.lacking(name, data))), "")
 
 
 def _read_variables(files: Files, bundle: Bundle) -> set[str]:

@@ -28,9 +28,11 @@ KINDS = {
     "fawkes_navgraph": "navgraph",
     "nav2_route_graph": "nav2_route",
     "lif": "lif",
+    "geotiff": "satellite",
 }
 
 REFUSED = {
+    "geotiff/rasterio/corrupt.tif": "damaged tile data",
     "kml/libkml/billion.kml": "entity expansion attack",
     "kmz/libkml/bad-too-large.kmz": "declares 4 GiB",
     "kmz/libkml/nokml.kmz": "no KML in it",

@@ -30,7 +30,7 @@ from app.model.features import Features
 from app.model.frame import GROUND, MAX_METRES, Anchor
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
-from app.model.imagery import Picture
+from app.model.imagery import Picture, displayed
 from app.model.layers import MAP, SITE, VECTOR_LAYERS, Layer, PartKey
 from app.model.voxels import DEPTH, Box3, VoxelMap
 from app.model.voxels import cut as cut_voxels
@@ -340,16 +340,15 @@ def _picture(key: PartKey, picture: Picture, accept: str) -> Response:
                 "width": width,
                 "height": height,
                 "bands": bands,
+                "type": picture.pixels.dtype.name,
+                "colours": list(picture.colours),
+                "nodata": picture.properties.get("nodata"),
                 "transform": list(picture.transform),
                 "crs": picture.crs,
+                "attribution": list(picture.attribution),
             }
         )
-    if picture.pixels.dtype != np.uint8 or bands > 4:
-        raise NotAcceptable(
-            f"a picture with {bands} bands of {picture.pixels.dtype} is no PNG: ask for the map in a format that "
-            "can hold it, or for application/json"
-        )
-    return Response(png(picture.pixels), media_type=kind)
+    return Response(png(displayed(picture)), media_type=kind)
 
 
 # --- choosing ---

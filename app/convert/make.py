@@ -17,6 +17,7 @@ from app.errors import CannotDerive, FleetMapError, Problem
 from app.formats import Format, WriteContext, _archive
 from app.model.features import Features
 from app.model.frame import GROUND
+from app.model.imagery import Picture
 from app.model.layers import LAYERS, VECTOR_LAYERS, Layer, Layers, PartKey
 from app.store import Store
 from app.store.values import PartEntry, Version
@@ -159,6 +160,8 @@ def _credit(key: PartKey, layers: Layers, entries: Mapping[PartKey, PartEntry]) 
     if key in entries:
         return list(entries[key].provenance.attribution)
     part = layers.parts.get(key)
+    if isinstance(part, Picture):
+        return list(part.attribution)
     said = part.document.get("attribution", ()) if isinstance(part, Features) else ()
     return [text for text in said if isinstance(text, str)] if isinstance(said, list | tuple) else []
 

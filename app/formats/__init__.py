@@ -152,6 +152,9 @@ class Format:
     check: the loader rules of the map's consumers, looked at in a map's files (main file first) without our reader
     or writer; ``app.formats.check`` says what it gives and what it may cost.
     looks_at: files of other maps of the upload that it looks into.
+    yields: a main file of this name only speaks for others (a world file for its picture), so it is none where one of
+    those is a main file itself. lacking: what a file needs that may be such a map but does not say enough by itself (a
+    picture without a place); empty for other files. completing: the read options that say it.
     """
 
     name: str
@@ -177,6 +180,9 @@ class Format:
     outlines: bool = False
     joined: bool = False
     check: Callable[[Files], Iterable[Problem]] | None = None
+    yields: Callable[[str], bool] = lambda name: False
+    lacking: Callable[[str, bytes], str] = lambda name, data: ""
+    completing: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,6 +256,14 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
         groups = [(asked, main or next(iter(sorted(files))))]
     out = []
     mains = {main for _, main in groups}
+    yielding = {
+        other
+        for known, main in groups
+        for other in known.companions(main, files[main], sorted(mains))
+        if other != main and known.yields(other) and not known.yields(main)
+    }
+    groups = [(known, main) for known, main in groups if main not in yielding]
+    mains -= yielding
     joined: dict[tuple[str, str], list[str]] = {}
     for known, main in groups:
         if known.joined:

@@ -10,9 +10,18 @@ from app.model.layers import MAP, Layer, PartKey
 
 
 def the_one(
-    keys: Sequence[PartKey], layer: Layer, name: str | None, level: str | None, *, what: str, option: str, supply: str
+    keys: Sequence[PartKey],
+    layer: Layer,
+    name: str | None,
+    level: str | None,
+    *,
+    what: str,
+    option: str,
+    supply: str,
+    usual: str = MAP,
 ) -> list[PartKey]:
-    """The named part; else ``map``, else the only one; on its level, else on the ground, else on the only one.
+    """The named part; else the one with the usual name, else the only one; on its level, else on the ground, else on
+    the only one.
 
     what: the part as users call it (``grid``). option: the parameter that names it. supply: what to upload. Raises
     MissingLayer, NotFound, or Ambiguous with the names to choose from.
@@ -25,7 +34,7 @@ def the_one(
     if not found:
         levels = ", ".join(sorted({key.level for key in every}))
         raise NotFound(f"there is no {what} on the level {level!r}; there are {what}s on: {levels}")
-    name = name or (MAP if MAP in names else names[0] if len(names) == 1 else None)
+    name = name or (usual if usual in names else names[0] if len(names) == 1 else None)
     if name is None:
         raise Ambiguous(f"there are several {what}s, name one with {option}=…: {', '.join(names)}")
     found = [key for key in found if key.name == name]

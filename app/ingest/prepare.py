@@ -21,6 +21,7 @@ from app.ingest.match import OWN_IDS, match_ids
 from app.model.features import Features, merge_documents
 from app.model.frame import Datum, Level
 from app.model.grid import UNKNOWN, OccupancyGrid
+from app.model.imagery import Picture
 from app.model.layers import Part, PartKey, Resources, join_levels
 from app.store import Store
 from app.store.changes import KEEP, Changes, Prepared, Provenance, Put, Replace
@@ -224,6 +225,8 @@ def _rename_documents(part: Features, family: str, names: Mapping[str, str]) -> 
 
 
 def _attribution(part: Part) -> list[str]:
+    if isinstance(part, Picture):
+        return list(part.attribution)
     stated = part.document.get("attribution", ()) if isinstance(part, Features) else ()
     return [str(line) for line in stated]
 

@@ -20,6 +20,8 @@ from app.model.frame import MAX_METRES, Datum
 
 Array = NDArray[np.float64]
 
+WGS84 = "EPSG:4326"
+
 
 class LocalFrame:
     """The local frame of a datum. Vectorised; every array is float64 of shape [n, 2] or [n, 3]."""
@@ -29,12 +31,28 @@ class LocalFrame:
     def __init__(self, datum: Datum) -> None:
         self.datum = datum
         # Degrees with 17 significant digits: PROJ reads back the same float64.
-        self._proj = Proj(
-            f"+proj=tmerc +lat_0={datum.latitude:.17g} +lon_0={datum.longitude:.17g} +k=1 +x_0=0 +y_0=0 "
-            "+ellps=WGS84 +units=m +no_defs"
-        )
+        self._proj = Proj(self._definition("+ellps=WGS84"))
         heading = math.radians(datum.heading)
         self._cos, self._sin = math.cos(heading), math.sin(heading)
+
+    def _definition(self, shape: str) -> str:
+        return (
+            f"+proj=tmerc +lat_0={self.datum.latitude:.17g} +lon_0={self.datum.longitude:.17g} +k=1 +x_0=0 +y_0=0 "
+            f"{shape} +units=m +no_defs"
+        )
+
+    @property
+    def crs(self) -> str:
+        """The frame before it is turned by the heading, as a CRS on WGS 84 in PROJ's words: east and north in metres.
+
+        With a heading of 0 its coordinates are the local ones; ``from_local`` gives them for any heading.
+        """
+        return self._definition("+datum=WGS84")
+
+    @property
+    def from_local(self) -> tuple[float, float, float, float]:
+        """(p, q, r, s) with east = p·x + q·y and north = r·x + s·y in ``crs``."""
+        return self._cos, self._sin, -self._sin, self._cos
 
     def to_local(self, lonlat: Array) -> Array:
         """(longitude, latitude[, altitude]) in degrees and metres -> (x, y[, z]) in metres.
@@ -116,7 +134,7 @@ def crs_bounds(crs: str, points: Array) -> tuple[float, float, float, float] | N
     points: float64 [n, 2], x first (easting, longitude) whatever the CRS's own order.
     """
     try:
-        longitude, latitude = _to_degrees(crs).transform(points[:, 0], points[:, 1])
+        longitude, latitude = _transformer(crs, WGS84).transform(points[:, 0], points[:, 1])
     except ProjError:
         return None
     if not (np.isfinite(longitude).all() and np.isfinite(latitude).all()):
@@ -124,6 +142,22 @@ def crs_bounds(crs: str, points: Array) -> tuple[float, float, float, float] | N
     return float(longitude.min()), float(latitude.min()), float(longitude.max()), float(latitude.max())
 
 
+def between(source: str, target: str, points: Array) -> Array:
+    """Points (x, y) of one CRS in another: float64 [n, 2], x (easting, longitude) first in both.
+
+    Places that the target cannot say come out infinite. Raises Invalid where PROJ knows no way between the two.
+    """
+    try:
+        x, y = _transformer(source, target).transform(points[:, 0], points[:, 1])
+    except ProjError as error:
+        raise Invalid(f"there is no way from the CRS {_short(source)} to {_short(target)}: {error}") from error
+    return np.column_stack([x, y])
+
+
+def _short(crs: str) -> str:
+    return crs if len(crs) <= 80 else crs[:79] + "…"
+
+
 @lru_cache(maxsize=64)
-def _to_degrees(crs: str) -> Transformer:
-    return Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+def _transformer(source: str, target: str) -> Transformer:
+    return Transformer.from_crs(source, target, always_xy=True)

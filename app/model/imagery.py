@@ -1,4 +1,4 @@
-"""Imagery: georeferenced pictures (satellite images, floor plans)."""
+"""Imagery: georeferenced pictures (satellite images, terrain models, floor plans)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,28 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import Invalid
+
+Affine = tuple[float, float, float, float, float, float]
+"""(a, b, c, d, e, f): x = a·column + b·row + c, y = d·column + e·row + f."""
+
+LOCAL = "local"
+STRIP = 2**18
+"""Pixels that are converted at a time: small enough for the processor's cache, so memory stays near the result's."""
+
+USUAL_COLOURS: Mapping[int, tuple[str, ...]] = {
+    1: ("gray",),
+    2: ("gray", "alpha"),
+    3: ("red", "green", "blue"),
+    4: ("red", "green", "blue", "alpha"),
+}
+"""What the bands of a picture are where nothing else is said."""
+
+CLEAR = ("alpha", "mask")
+"""Bands that say where there is a picture at all: ``alpha`` in shades, ``mask`` yes (not 0) or no (0)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,12 +37,17 @@ class Picture:
 
     pixels: [height, width, bands], row 0 on top. transform: (a, b, c, d, e, f) with x = a·column + b·row + c and
     y = d·column + e·row + f for the outer corner of a pixel. crs: ``local`` (metres in the local frame) or a CRS
-    name that PROJ knows (``EPSG:32630``).
+    that PROJ knows (``EPSG:32630``, or its WKT); x is always easting or longitude.
+
+    properties: ``bands`` [{colour, description?, unit?, scale?, offset?}], one for each band, where colour is GDAL's
+    word (gray, red, green, blue, alpha, palette, undefined …) or ``mask``; ``nodata`` a number, or ``nan``, ``inf``,
+    ``-inf``; ``palette`` [[red, green, blue, alpha], …] that the values of a ``palette`` band index; ``attribution``
+    [texts].
     """
 
     pixels: NDArray[Any]
-    transform: tuple[float, float, float, float, float, float]
-    crs: str = "local"
+    transform: Affine
+    crs: str = LOCAL
     properties: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -37,3 +61,130 @@ class Picture:
         if not self.crs:
             raise Invalid("a picture needs a CRS: local, or a name such as EPSG:32630")
         self.pixels.flags.writeable = False
+
+    @property
+    def colours(self) -> tuple[str, ...]:
+        """What each band is."""
+        count = int(self.pixels.shape[2])
+        said = self.properties.get("bands")
+        if isinstance(said, list | tuple) and len(said) == count and all(isinstance(b, Mapping) for b in said):
+            return tuple(str(b.get("colour", "undefined")) for b in said)
+        return USUAL_COLOURS.get(count, ("gray",) + ("undefined",) * (count - 1))
+
+    @property
+    def nodata(self) -> float | int | None:
+        """The value of pixels that hold nothing; None where there is no such value."""
+        said = self.properties.get("nodata")
+        if isinstance(said, str):
+            return float(said) if said in ("nan", "inf", "-inf") else None
+        return said if isinstance(said, int | float) and not isinstance(said, bool) else None
+
+    @property
+    def attribution(self) -> tuple[str, ...]:
+        """Licences and credits of the picture."""
+        said = self.properties.get("attribution")
+        return tuple(text for text in said if isinstance(text, str)) if isinstance(said, list | tuple) else ()
+
+    def outline(self, steps: int = 1) -> NDArray[np.float64]:
+        """Points (x, y) along the border, from the upper left corner on clockwise: float64 [4 · steps, 2]."""
+        height, width = self.pixels.shape[:2]
+        part = np.arange(steps) / steps
+        u = np.concatenate([part, np.ones(steps), 1 - part, np.zeros(steps)]) * width
+        v = np.concatenate([np.zeros(steps), part, np.ones(steps), 1 - part]) * height
+        return placed(self.transform, u, v)
+
+
+def placed(transform: Affine, column: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where places of the picture (columns and rows from the outer corner of the first pixel) lie: float64 [n, 2]."""
+    a, b, c, d, e, f = transform
+    return np.column_stack([a * column + b * row + c, d * column + e * row + f])
+
+
+def displayed(picture: Picture) -> NDArray[np.uint8]:
+    """A picture as screens show it: uint8 [height, width, 1…4] (grey, grey + alpha, RGB, RGBA).
+
+    8-bit values stay as they are; others are stretched, so that the least becomes 0 and the greatest 255, all bands
+    alike. Bands beyond the colours are left out, a palette is looked up. No-data and numbers that are none become
+    transparent.
+    """
+    pixels, colours = picture.pixels, picture.colours
+    height, width, _ = pixels.shape
+    clear = next((k for k, colour in enumerate(colours) if colour in CLEAR), None)
+    table = _palette(picture)
+    if all(colour in colours for colour in USUAL_COLOURS[3]):
+        shown = [colours.index(colour) for colour in USUAL_COLOURS[3]]
+    else:
+        first = next((k for k, colour in enumerate(colours) if colour in ("palette", "gray")), None)
+        shown = [first if first is not None else next((k for k in range(len(colours)) if k != clear), 0)]
+    nodata = picture.nodata
+    holes = clear is not None or nodata is not None or pixels.dtype.kind == "f"
+    rows = max(1, STRIP // width)
+    low, high = (0.0, 255.0) if pixels.dtype == np.uint8 or table is not None else _range(picture, shown, rows)
+    if table is not None:
+        out = np.empty((height, width, 4), np.uint8)
+    else:
+        out = np.empty((height, width, len(shown) + holes), np.uint8)
+    for y in range(0, height, rows):
+        block = pixels[y : y + rows]
+        values = block[..., shown]
+        known = _known(values, nodata)
+        if table is not None:
+            index = np.clip(values[..., 0], 0, 255).astype(np.uint8)
+            out[y : y + rows] = table[index]
+            out[y : y + rows, :, 3][~known] = 0
+        elif pixels.dtype == np.uint8:
+            out[y : y + rows, :, : len(shown)] = values
+        else:
+            # Halved, since the distance of two float64 may be beyond float64.
+            scaled = np.where(known[..., None], values, low).astype(np.float64) / 2 - low / 2
+            scaled = scaled / (high / 2 - low / 2) * 255.0
+            out[y : y + rows, :, : len(shown)] = np.clip(np.round(scaled), 0, 255)
+        if holes:
+            opaque = np.where(known, 255, 0).astype(np.uint8)
+            if clear is not None:
+                opaque = np.minimum(opaque, _opacity(block[..., clear], colours[clear]))
+            last = out[y : y + rows, :, -1]
+            last[...] = np.minimum(last, opaque) if table is not None else opaque
+    return out
+
+
+def _known(values: NDArray[Any], nodata: float | int | None) -> NDArray[np.bool_]:
+    """Which pixels hold something: [rows, columns] of values [rows, columns, bands]."""
+    known = np.isfinite(values).all(axis=-1) if values.dtype.kind == "f" else np.ones(values.shape[:-1], bool)
+    if nodata is not None and math.isfinite(nodata):
+        known &= ~(values == nodata).all(axis=-1)
+    return known
+
+
+def _range(picture: Picture, shown: list[int], rows: int) -> tuple[float, float]:
+    """The least and the greatest value that is shown."""
+    low, high = math.inf, -math.inf
+    for y in range(0, len(picture.pixels), rows):
+        values = picture.pixels[y : y + rows][..., shown]
+        values = values[_known(values, picture.nodata)]
+        if values.size:
+            low, high = min(low, float(values.min())), max(high, float(values.max()))
+    if not low < high:  # nothing known, or one value everywhere
+        return (low, low + 1.0) if math.isfinite(low) and low + 1.0 > low else (0.0, 1.0)
+    return low, high
+
+
+def _opacity(values: NDArray[Any], colour: str) -> NDArray[np.uint8]:
+    if colour == "mask":
+        return np.where(values != 0, 255, 0).astype(np.uint8)
+    if values.dtype == np.uint8:
+        return values
+    most = float(np.iinfo(values.dtype).max) if values.dtype.kind in "iu" else 1.0
+    return np.clip(np.round(values.astype(np.float64) * (255.0 / most)), 0, 255).astype(np.uint8)
+
+
+def _palette(picture: Picture) -> NDArray[np.uint8] | None:
+    """RGBA [256, 4] of the values, where the picture has a palette of that size."""
+    said = picture.properties.get("palette")
+    if "palette" not in picture.colours or not isinstance(said, list | tuple) or picture.pixels.dtype != np.uint8:
+        return None
+    table = np.zeros((256, 4), np.uint8)
+    table[:, 3] = 255
+    entries = np.array(said[:256], np.uint8).reshape(-1, 4)
+    table[: len(entries)] = entries
+    return table

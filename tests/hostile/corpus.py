@@ -1026,6 +1026,167 @@ def network_cases() -> Iterator[Case]:
     )
 
 
+# --- pictures with a place ---------------------------------------------------------------------------------------
+
+
+def tiff(
+    tags: dict[int, tuple[int, int, int]], tail: bytes = b"", *, following: int = 0, count: int | None = None
+) -> bytes:
+    """A little-endian TIFF of one page: tag -> (type, count, value or offset); the tail follows it at once."""
+    body = b"".join(struct.pack("<HHII", tag, *entry) for tag, entry in sorted(tags.items()))
+    number = len(tags) if count is None else count
+    return b"II*\0" + struct.pack("<IH", 8, number) + body + struct.pack("<I", following) + tail
+
+
+def geotiff(
+    changed: dict[int, tuple[int, int, int] | None] | None = None, pixels: bytes = bytes(12), **more: int
+) -> bytes:
+    """A whole one of 4 × 3 grey pixels with a place, with other values of some tags (None: without the tag)."""
+    tags: dict[int, tuple[int, int, int]] = {
+        256: (3, 1, 4), 257: (3, 1, 3), 258: (3, 1, 8), 259: (3, 1, 1), 262: (3, 1, 1), 273: (4, 1, 0), 277: (3, 1, 1),
+        278: (3, 1, 3), 279: (4, 1, len(pixels)), 33550: (12, 3, 0), 33922: (12, 6, 0),
+    }  # fmt: skip
+    changed = changed or {}
+    kept = {t: e for t, e in ({**tags, **changed}).items() if e is not None}
+    start = 8 + 2 + 12 * len(kept) + 4
+    place = struct.pack("<3d", 0.5, 0.5, 0.0), struct.pack("<6d", 0, 0, 0, 100.0, 200.0, 0)
+    for tag, offset in ((33550, start), (33922, start + 24), (273, start + 72)):
+        if tag in kept and tag not in changed:
+            kept[tag] = (*kept[tag][:2], offset)
+    return tiff(kept, place[0] + place[1] + pixels, **more)
+
+
+def satellite_cases() -> Iterator[Case]:
+    """TIFF that lies, loops or unfolds; world files of odd numbers; pictures that take long."""
+    yield Case("satellite/as it should be", {"a.tif": geotiff()}, "read")
+    packed = zlib.compress(bytes(2**24), 9)
+    huge = (4, 1, 2**32 - 1)
+    for name, data in {
+        "2^32 wide": geotiff({256: huge}),
+        "2^32 high": geotiff({257: huge}),
+        "2^32 both ways": geotiff({256: huge, 257: huge}),
+        "40000 x 40000": geotiff({256: (4, 1, 40_000), 257: (4, 1, 40_000), 278: (4, 1, 40_000)}),
+        "0 wide": geotiff({256: (4, 1, 0)}),
+        "no width": geotiff({256: None}),
+        "65535 bands": geotiff({277: (3, 1, 65_535), 256: (4, 1, 4000), 257: (4, 1, 4000), 278: (4, 1, 4000)}),
+        "pixels missing": geotiff(pixels=b"")[:-1],
+        "pixels cut": geotiff()[:-6],
+        "pixels beyond the end": geotiff({273: (4, 1, 2**31)}),
+        "count of pixels lies": geotiff({279: (4, 1, 2**31)}, b""),
+        "compression unknown": geotiff({259: (3, 1, 12345)}),
+        "LZW of nothing": geotiff({259: (3, 1, 5)}),
+        "deflate of nothing": geotiff({259: (3, 1, 8)}),
+        "JPEG of nothing": geotiff({259: (3, 1, 7)}),
+        "G4 fax of nothing": geotiff({259: (3, 1, 4), 258: (3, 1, 1)}),
+        "ZSTD of nothing": geotiff({259: (3, 1, 50_000)}),
+        "LERC of nothing": geotiff({259: (3, 1, 34_887)}),
+        "WebP of nothing": geotiff({259: (3, 1, 50_001)}),
+        "tiles of 2^31": geotiff(
+            {322: (4, 1, 2**31), 323: (4, 1, 2**31), 324: (4, 1, 8), 325: (4, 1, 4), 273: None, 279: None}
+        ),
+        "tiles of 0": geotiff({322: (4, 1, 0), 323: (4, 1, 0), 324: (4, 1, 8), 325: (4, 1, 4), 273: None, 279: None}),
+        "scale of NaN": geotiff().replace(struct.pack("<d", 0.5), struct.pack("<d", float("nan"))),
+        "scale of 1e300": geotiff().replace(struct.pack("<d", 0.5), struct.pack("<d", 1e300)),
+        "place of inf": geotiff().replace(struct.pack("<d", 100.0), struct.pack("<d", float("inf"))),
+        "no page": b"II*\0" + bytes(4),
+        "page beyond the end": b"II*\0" + struct.pack("<I", 2**31),
+        "header only": b"II*\0",
+        "pages in a loop": geotiff(following=8),
+        "many pages": many_pages(60_000),
+        "BigTIFF header only": b"II+\0\x08\0\0\0" + struct.pack("<Q", 2**63),
+        "65535 tags": tiff(dict.fromkeys(range(5), (1, 1, 0)), count=65_535),
+        "complex numbers": geotiff({339: (3, 1, 6), 258: (3, 1, 64)}, bytes(96)),
+        "VRT": b"<VRTDataset rasterXSize='9' rasterYSize='9'><VRTRasterBand><SimpleSource><SourceFilename>/etc/passwd</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>",
+        "not a picture": b"hello",
+    }.items():
+        yield Case(f"satellite/tiff {name}", {"a.tif": data}, "refused", "satellite")
+    for name, data in {
+        "page after itself": geotiff(following=9),
+        "next page beyond the end": geotiff(following=2**32 - 1),
+        "bomb of 16 MB": geotiff({256: (4, 1, 4096), 257: (4, 1, 4096), 278: (4, 1, 4096), 259: (3, 1, 8)}, packed),
+        "all pixels left out": geotiff(
+            {256: (4, 1, 16_000), 257: (4, 1, 16_000), 278: (4, 1, 16_000), 273: (4, 1, 0), 279: (4, 1, 0)}
+        ),
+        "text without an end": geotiff({270: (2, 2**30, 8)}),
+        "GDAL's own words": geotiff({42112: (2, 40, 8)}),
+        "keys that lie": geotiff({34735: (3, 60_000, 8)}),
+        "keys in a ring": geotiff({34735: (3, 8, 8), 34737: (2, 30, 8)}),
+        "colours of nothing": geotiff({262: (3, 1, 3)}),
+        "samples of 3 bit": geotiff({258: (3, 1, 3)}),
+        "samples of 0 bit": geotiff({258: (3, 1, 0)}),
+        "nodata of text": geotiff({42113: (2, 4, 0x006E616E)}),
+    }.items():
+        yield Case(f"satellite/tiff {name}", {"a.tif": data}, "any", "satellite")
+        yield Case(f"satellite/tiff {name}, unnamed", {"a.tif": data}, "any")
+    small = png(4, 3, b"".join(b"\0" + bytes(4) for _ in range(3)))
+    numbers = ["1", "0", "0", "-1", "0", "0"]
+    for value in ("nan", "inf", "-inf", "1e999", "1,5", "0x10", "1_0", "", "one", HUGE, "\u0661", "1;"):
+        for place in (0, 5):
+            lines = [*numbers[:place], value, *numbers[place + 1 :]]
+            text = "\n".join(lines).encode()
+            yield Case(f"satellite/world {value[:9]!r} in line {place + 1}", {"a.pgw": text, "a.png": small}, "refused")
+    for name, text in {
+        "zeros": b"0\n" * 6,
+        "flat": b"1\n1\n1\n1\n0\n0\n",
+        "empty": b" ",
+        "five lines": b"1\n0\n0\n-1\n0\n",
+        "huge": b"1e300\n0\n0\n-1e300\n0\n0\n",
+        "far away": b"1\n0\n0\n-1\n1e15\n0\n",
+        "binary": bytes(range(256)),
+        "a megabyte": b"1\n" * 2**19,
+    }.items():
+        yield Case(f"satellite/world {name}", {"a.pgw": text, "a.png": small}, "refused")
+    good = "\n".join(numbers).encode()
+    for name, data in {
+        "a bomb": png(16_000, 16_000, None),
+        "2^31 wide": png(2**31 - 1, 2**31 - 1, None),
+        "a JPEG without an end": b"\xff\xd8\xff\xe0\x00\x10JFIF\0" + bytes(50),
+        "a JPEG of 1000 scans": b"\xff\xd8\xff" + b"\xff\xda\0\x08\1\1\0\0\x3f\0" * 1000 + b"\xff\xd9",
+        "a text": b"hello",
+        "a GIF": b"GIF89a" + bytes(100),
+    }.items():
+        yield Case(f"satellite/world of {name}", {"a.wld": good, "a.png": data}, "refused")
+    for name, text in {
+        "entities": b"<!DOCTYPE a [<!ENTITY x 'y'>]><PAMDataset><SRS>&x;</SRS></PAMDataset>",
+        "a path": b"<PAMDataset><SRS>/etc/passwd</SRS></PAMDataset>",
+        "an address": b"<PAMDataset><SRS>http://127.0.0.1:1/x</SRS></PAMDataset>",
+        "a grid file": b'<PAMDataset><SRS>GEOGCS["x",EXTENSION["PROJ4","+proj=longlat +nadgrids=/etc/passwd"]]</SRS></PAMDataset>',
+        "deep WKT": b"<PAMDataset><SRS>" + b"PROJCS[" * 9000 + b"</SRS></PAMDataset>",
+    }.items():
+        yield Case(f"satellite/aux.xml of {name}", {"a.pgw": good, "a.png": small, "a.png.aux.xml": text}, "refused")
+        lone = text.partition(b"<SRS>")[2].partition(b"</SRS>")[0]
+        yield Case(f"satellite/prj of {name}", {"a.pgw": good, "a.png": small, "a.prj": lone}, "refused")
+
+
+def many_pages(count: int) -> bytes:
+    """Pages of one pixel each, all of them the same but for the next one's place."""
+    out = [geotiff(following=0)]
+    start = len(out[0])
+    size = 2 + 12 * 9 + 4
+    first = bytearray(out[0])
+    (tags,) = struct.unpack_from("<H", first, 8)
+    struct.pack_into("<I", first, 10 + 12 * tags, start)
+    page = b"".join(
+        struct.pack("<HHII", *entry)
+        for entry in (
+            (256, 3, 1, 1),
+            (257, 3, 1, 1),
+            (258, 3, 1, 8),
+            (259, 3, 1, 1),
+            (262, 3, 1, 1),
+            (273, 4, 1, 8),
+            (277, 3, 1, 1),
+            (278, 3, 1, 1),
+            (279, 4, 1, 1),
+        )
+    )
+    pages = [
+        struct.pack("<H", 9) + page + struct.pack("<I", start + size * (k + 1) if k + 1 < count else 0)
+        for k in range(count)
+    ]
+    return bytes(first) + b"".join(pages)
+
+
 ACCORDING_TO_KIND = (
     yaml_cases,
     xml_cases,
@@ -1033,6 +1194,7 @@ ACCORDING_TO_KIND = (
     pbf_cases,
     json_cases,
     picture_cases,
+    satellite_cases,
     archive_cases,
     folder_cases,
     network_cases,

@@ -1,0 +1,372 @@
+"""GeoTIFF read and written by GDAL, from and to memory: what the given bytes hold, and nothing else.
+
+Only the GTiff driver is let at an upload, by bytes in memory: no sidecar, no VRT, no address of it is ever opened
+(security, reading 10). Size and memory are checked by the header, before a pixel is decoded (reading 7).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import BadUpload, TooLarge, UnreadableFile
+from app.formats import Limits
+from app.model.gdal import DATA_TYPES, gdal, native, opened
+from app.model.imagery import LOCAL, Affine, Picture
+
+NO_TRANSFORM: Affine = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+OWN_TAG = "FLEETMAP_CRS"
+"""Our own metadata item: ``local`` where the coordinates are metres of the local frame, which no CRS names."""
+
+MAX_WKT = 2**16
+"""Characters. PROJ's largest definitions have a tenth of it."""
+
+MEMORY_SHARE = 3
+"""Decoded pixels may fill this part of a worker's memory, since the rest is needed to keep and write them."""
+
+GEO_TAGS = frozenset({33550, 33922, 34264, 34735})
+"""ModelPixelScale, ModelTiepoint, ModelTransformation, GeoKeyDirectory (OGC 19-008r4)."""
+GDAL_METADATA = 42112
+MAX_TAGS = 4096
+MAX_PAGES = 1000
+"""Overviews and masks are pages too: real files have up to about thirty."""
+
+_MEMORY_NAME = re.compile(r"/vsimem/[0-9a-f-]+/[0-9a-f-]+\.tif(?:, band \d+)?:?\s*")
+
+
+@dataclass(frozen=True, slots=True)
+class Raster:
+    """A decoded TIFF. transform, crs: None where it has none; properties: as ``Picture`` has them, with its tags."""
+
+    pixels: NDArray[Any]
+    transform: Affine | None
+    crs: str | None
+    properties: dict[str, Any] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
+
+
+# --- telling ------------------------------------------------------------------------------------------------------
+def is_tiff(data: bytes) -> bool:
+    """By the first bytes: TIFF or BigTIFF, in either byte order."""
+    return data[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+
+def is_georeferenced(data: bytes) -> bool:
+    """Whether the first page of a TIFF says where it lies, by its tags alone."""
+    found = _tags(data)
+    if GEO_TAGS & found.keys():
+        return True
+    start, size = found.get(GDAL_METADATA, (0, 0))
+    return OWN_TAG.encode() in data[start : start + size]
+
+
+def _tags(data: bytes) -> dict[int, tuple[int, int]]:
+    """The first page's tags: number -> (offset, count); none where the file is damaged."""
+    page = next(_pages(data), None)
+    if page is None:
+        return {}
+    order, big, at, count = page
+    entry = order + ("HHQQ" if big else "HHII")
+    step = struct.calcsize(entry)
+    try:
+        rows = [struct.unpack_from(entry, data, at + k * step) for k in range(min(count, MAX_TAGS))]
+    except struct.error:
+        return {}
+    return {tag: (offset, size) for tag, _, size, offset in rows}
+
+
+def _pages(data: bytes) -> Iterator[tuple[str, bool, int, int]]:
+    """Each page of a TIFF as (byte order, whether it is a BigTIFF, where its tags start, how many), up to the first
+    damage; endless where they form a loop."""
+    if not is_tiff(data):
+        return
+    order = "<" if data[:2] == b"II" else ">"
+    big = data[2:4] in (b"+\0", b"\0+")
+    place, number, step = (order + "Q", order + "Q", 20) if big else (order + "I", order + "H", 12)
+    try:
+        (at,) = struct.unpack_from(place, data, 8 if big else 4)
+        while at:
+            (count,) = struct.unpack_from(number, data, at)
+            at += struct.calcsize(number)
+            yield order, big, at, count
+            (at,) = struct.unpack_from(place, data, at + count * step)
+    except (struct.error, OverflowError):
+        return
+
+
+# --- GDAL ---------------------------------------------------------------------------------------------------------
+def crs_name(crs: Any) -> str:
+    """A CRS of rasterio as pictures name it: ``EPSG:32630`` where that is exactly it, else WKT; ``local`` for one that
+    is not tied to the earth. Raises UnreadableFile for one that would make PROJ open files."""
+    found = crs.to_authority(confidence_threshold=100)
+    if found:
+        name = ":".join(found)
+        if type(crs).from_user_input(name) == crs:
+            return name
+    text = str(crs.to_wkt(version="WKT2_2019"))
+    check_wkt(text)
+    return LOCAL if re.match(r"\s*(ENGCRS|ENGINEERINGCRS|LOCAL_CS|LOCAL_DATUM)", text, re.IGNORECASE) else text
+
+
+def check_wkt(text: str) -> None:
+    """Refuse a definition that is too long, or that names files (grids of shifts) of this machine."""
+    if len(text) > MAX_WKT:
+        raise UnreadableFile(f"the definition of its CRS has {len(text)} characters; the limit is {MAX_WKT}")
+    for grids in re.findall(r"grids\s*=\s*([^\s\"]*)", text, re.IGNORECASE):
+        if grids != "@null":
+            raise UnreadableFile("the definition of its CRS names a grid file: state it as EPSG:<number>")
+
+
+def crs_from_wkt(text: str) -> str:
+    """The name of a CRS that is given as WKT (a .prj file). Raises UnreadableFile."""
+    check_wkt(text)
+    with gdal() as rasterio:
+        try:
+            return crs_name(rasterio.crs.CRS.from_wkt(text.strip()))
+        except rasterio.errors.CRSError as error:
+            raise UnreadableFile(f"its CRS cannot be read: {_reason(error)}") from error
+
+
+def _reason(error: BaseException) -> str:
+    """What GDAL said first of all, without the names it has for memory."""
+    said = str(error)
+    while (deeper := error.__cause__ or error.__context__) is not None and str(deeper):
+        error, said = deeper, str(deeper)
+    text = _MEMORY_NAME.sub("", said).replace("'/vsimem", "'").strip()
+    return re.sub(r"/vsimem/\S*", "the file", text)[:300] or type(error).__name__
+
+
+# --- reading ------------------------------------------------------------------------------------------------------
+def read_tiff(data: bytes, limits: Limits) -> Raster:
+    """A TIFF's first page, decoded. Raises UnreadableFile or TooLarge, before anything large is allocated."""
+    from rasterio._err import CPLE_BaseError  # type: ignore[import-untyped]
+    from rasterio.io import MemoryFile  # type: ignore[import-untyped]
+
+    if next(itertools.islice(_pages(data), MAX_PAGES, None), None) is not None:
+        raise TooLarge(f"the TIFF has more than {MAX_PAGES} pages, or its pages form a loop")
+    with gdal() as rasterio:
+        errors = (rasterio.errors.RasterioError, CPLE_BaseError, OSError, ValueError, TypeError, ArithmeticError)
+        try:
+            with MemoryFile(data) as file, file.open(driver="GTiff", GEOREF_SOURCES="INTERNAL") as dataset:
+                _check_size(dataset, limits)
+                return _decoded(dataset, rasterio)
+        except BadUpload:
+            raise
+        except errors as error:
+            raise UnreadableFile(f"the TIFF is damaged or of a kind that is not read: {_reason(error)}") from error
+
+
+def _check_size(dataset: Any, limits: Limits) -> None:
+    width, height, count = dataset.width, dataset.height, dataset.count
+    kinds = sorted(set(dataset.dtypes))
+    if width < 1 or height < 1 or count < 1:
+        raise UnreadableFile(f"the TIFF says it has {width} × {height} pixels in {count} bands")
+    if width * height > limits.pixels:
+        raise TooLarge(
+            f"the TIFF says it has {width} × {height} = {width * height} pixels; the limit is {limits.pixels} "
+            "(FLEETMAP_MAX_PIXELS)"
+        )
+    if len(kinds) != 1 or kinds[0] not in DATA_TYPES:
+        raise UnreadableFile(f"the TIFF's pixels are {', '.join(kinds)}; whole and floating numbers are read")
+    size = width * height * count * np.dtype(kinds[0]).itemsize
+    most = limits.memory_bytes // MEMORY_SHARE
+    if size > most:
+        raise TooLarge(f"the TIFF's pixels take {size} bytes ({count} bands of {kinds[0]}); the limit is {most}")
+
+
+def _decoded(dataset: Any, rasterio: Any) -> Raster:
+    count, height, width = dataset.count, dataset.height, dataset.width
+    doubts = []
+    pages = len(dataset.subdatasets)
+    if pages > 1:
+        doubts.append(f"it has {pages} pages: the first one is read, the others are kept in the source only")
+    colours = [c.name for c in dataset.colorinterp]
+    nodata = dataset.nodata
+    flags = dataset.mask_flag_enums[0]
+    masked = rasterio.enums.MaskFlags.per_dataset in flags and not {
+        rasterio.enums.MaskFlags.alpha,
+        rasterio.enums.MaskFlags.nodata,
+    } & set(flags)
+    kind = np.dtype(dataset.dtypes[0])
+    pixels = np.empty((count + masked, height, width), kind)
+    dataset.read(out=pixels[:count])
+    if masked:
+        full = 127 if kind == np.int8 else 255
+        np.multiply(dataset.read_masks(1) != 0, full, out=pixels[count], casting="unsafe")
+    transform: Affine | None = tuple(float(v) for v in dataset.transform[:6])  # type: ignore[assignment]
+    own = _texts(dataset.tags())
+    local = own.pop(OWN_TAG, None) == LOCAL
+    crs = crs_name(dataset.crs) if dataset.crs else LOCAL if local else None
+    if transform == NO_TRANSFORM and not local:
+        transform = None
+        points, points_crs = dataset.gcps
+        if points:
+            plane = fitted([(p.col, p.row, p.x, p.y) for p in points])
+            if plane is None:
+                raise UnreadableFile("its ground control points lie on one line: they do not say where it lies")
+            transform, off = plane
+            crs = crs_name(points_crs) if points_crs else crs
+            if off > 0.5:
+                doubts.append(
+                    f"its {len(points)} ground control points are {off:.1f} pixels off the plane through them: warp it "
+                    "(gdalwarp) for a closer fit"
+                )
+        elif dataset.rpcs:
+            raise UnreadableFile("it is placed by a sensor model (RPC) only: orthorectify it first (gdalwarp -rpc)")
+    bands = []
+    for k, colour in enumerate(colours):
+        said = {
+            "description": dataset.descriptions[k] or None,
+            "unit": dataset.units[k] or None,
+            "scale": _unless(dataset.scales[k], 1.0),
+            "offset": _unless(dataset.offsets[k], 0.0),
+        }
+        band: dict[str, Any] = {"colour": colour, **{name: value for name, value in said.items() if value is not None}}
+        tags = _texts(dataset.tags(k + 1))
+        if tags:
+            band["satellite"] = {"tags": tags}
+        bands.append(band)
+    if masked:
+        bands.append({"colour": "mask"})
+    properties: dict[str, Any] = {"bands": bands}
+    if nodata is not None:
+        whole = math.isfinite(nodata) and kind.kind in "iu" and float(nodata).is_integer()
+        properties["nodata"] = int(nodata) if whole else nodata if math.isfinite(nodata) else str(float(nodata))
+    if "palette" in colours:
+        table = dataset.colormap(colours.index("palette") + 1)
+        properties["palette"] = [list(table[k]) for k in sorted(table)]
+    if own.get("AREA_OR_POINT") == "Area":
+        del own["AREA_OR_POINT"]
+    own.pop("OVR_RESAMPLING_ALG", None)
+    if own.get("TIFFTAG_COPYRIGHT"):
+        properties["attribution"] = [own["TIFFTAG_COPYRIGHT"]]
+    if own:
+        properties["satellite"] = {"tags": own}
+    return Raster(np.moveaxis(pixels, 0, 2), transform, crs, properties, tuple(doubts))
+
+
+def _unless(value: float, usual: float) -> float | None:
+    """A number that says something: finite, and not the usual one."""
+    return float(value) if math.isfinite(value) and value != usual else None
+
+
+def _texts(tags: Mapping[str, str]) -> dict[str, str]:
+    """Tags whose names and values any answer can hold."""
+    return {
+        name: value
+        for name, value in tags.items()
+        if name and not re.search("[\ud800-\udfff\0]", name + value) and name not in ("ns", "bidx")
+    }
+
+
+def fitted(points: Sequence[tuple[float, float, float, float]]) -> tuple[Affine, float] | None:
+    """The affine transform nearest to (column, row, x, y) points, and how far the worst of them is off, in pixels."""
+    table = np.array(points, np.float64)
+    if not np.isfinite(table).all():
+        return None
+    place = np.column_stack([table[:, 0], table[:, 1], np.ones(len(table))])
+    found, _, rank, _ = np.linalg.lstsq(place, table[:, 2:], rcond=None)
+    if rank < 3:
+        return None
+    (a, d), (b, e), (c, f) = found.tolist()
+    off = place @ found - table[:, 2:]
+    area = abs(a * e - b * d)
+    worst = float(np.hypot(off[:, 0], off[:, 1]).max())
+    return (a, b, c, d, e, f), worst / math.sqrt(area) if area > 0.0 else math.inf
+
+
+# --- writing ------------------------------------------------------------------------------------------------------
+def write_cog(picture: Picture, crs: str | None, tags: Mapping[str, str]) -> bytes:
+    """A cloud optimized GeoTIFF: tiles of 512 pixels, overviews from there on, deflate with a predictor.
+
+    crs: what it is called, None for none. tags: of the whole file. The pixels are not copied: GDAL reads them where
+    they are. No clock and no version goes in, so equal pictures give equal bytes.
+    """
+    from rasterio import shutil  # type: ignore[import-untyped]
+    from rasterio.io import MemoryFile
+
+    pixels = native(picture.pixels)
+    colours = picture.colours
+    count = pixels.shape[2]
+    masked = count > 1 and colours[-1] == "mask"
+    count -= masked
+    options = {
+        "COMPRESS": "DEFLATE",
+        "PREDICTOR": "YES",
+        "LEVEL": "6",
+        "BLOCKSIZE": "512",
+        "BIGTIFF": "IF_SAFER",
+        "NUM_THREADS": "1",
+        "OVERVIEW_RESAMPLING": "NEAREST" if "palette" in colours or not _is_shade(picture) else "AVERAGE",
+    }
+    with gdal() as rasterio, MemoryFile() as out:
+        with opened(rasterio, pixels, count, described=True) as dataset:
+            _describe(dataset, picture, colours[:count], crs, tags, rasterio)
+            if masked:
+                dataset.write_mask(pixels[..., count] != 0)
+            shutil.copy(dataset, out.name, driver="COG", **options)
+        return bytes(out.getbuffer())
+
+
+def _is_shade(picture: Picture) -> bool:
+    """Whether values between values mean something: shades and heights, not names (whole numbers of no colour)."""
+    return picture.pixels.dtype.kind == "f" or picture.pixels.dtype == np.uint8
+
+
+def _describe(
+    dataset: Any, picture: Picture, colours: Sequence[str], crs: str | None, tags: Mapping[str, str], rasterio: Any
+) -> None:
+    known = rasterio.enums.ColorInterp
+    dataset.transform = rasterio.Affine(*picture.transform)
+    if crs is not None:
+        dataset.crs = rasterio.crs.CRS.from_user_input(crs)
+    nodata = picture.nodata
+    if nodata is not None and _holds(picture.pixels.dtype, nodata):
+        dataset.nodata = nodata
+    dataset.colorinterp = [known[c] if c in known.__members__ else known.undefined for c in colours]
+    said = picture.properties.get("bands")
+    bands = list(said)[: len(colours)] if isinstance(said, list | tuple) else []
+    for k, band in enumerate(bands):
+        if not isinstance(band, Mapping):
+            continue
+        if isinstance(band.get("description"), str):
+            dataset.set_band_description(k + 1, band["description"])
+        if isinstance(band.get("unit"), str):
+            dataset.set_band_unit(k + 1, band["unit"])
+        own = band.get("satellite")
+        if isinstance(own, Mapping) and isinstance(own.get("tags"), Mapping):
+            dataset.update_tags(k + 1, **{str(n): str(v) for n, v in sorted(own["tags"].items())})
+    for name, usual in (("scale", 1.0), ("offset", 0.0)):
+        values = [b.get(name, usual) if isinstance(b, Mapping) else usual for b in bands]
+        if any(v != usual for v in values):
+            setattr(dataset, name + "s", [float(v) for v in values] + [usual] * (len(colours) - len(values)))
+    palette = picture.properties.get("palette")
+    if "palette" in colours and isinstance(palette, list | tuple):
+        table = {k: tuple(int(v) for v in entry) for k, entry in enumerate(palette)}
+        dataset.write_colormap(colours.index("palette") + 1, table)
+    dataset.update_tags(**{name: tags[name] for name in sorted(tags)})
+
+
+def _holds(kind: np.dtype[Any], value: float) -> bool:
+    """Whether pixels of this type can have the value."""
+    if kind.kind == "f":
+        return True
+    if not (math.isfinite(value) and float(value).is_integer()):
+        return False
+    info = np.iinfo(kind) if kind.kind in "iu" else None
+    return info is not None and info.min <= value <= info.max
+
+
+def wkt_of(crs: str) -> str:
+    """A CRS as WKT 1 where that can say it (older tools read no other), else WKT 2."""
+    with gdal() as rasterio:
+        return str(rasterio.crs.CRS.from_user_input(crs).to_wkt())

@@ -1,0 +1,517 @@
+"""Georeferenced pictures: GeoTIFF, PNG and JPEG with a world file, pictures whose corners are given, floor plans.
+
+A GeoTIFF says by itself where it lies. A world file (.pgw, .jgw, .tfw, .wld) has six lines A, D, B, E, C, F: x =
+A·column + B·row + C and y = D·column + E·row + F for the *centre* of a pixel (ESRI's and GDAL's rule); the CRS stands
+in a .prj or .aux.xml beside it. ``corners`` are [latitude, longitude]. Pixels stay as they came; they are resampled
+where a request asks for another CRS (``app.model.resampling``). Written: a cloud optimized GeoTIFF, or PNG with a world
+file.
+
+Coordinates without a CRS are degrees where they can be (pixels of at most 0.0002°, about 20 m, on the globe), else
+metres of the local frame; both with a warning.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from app.errors import Invalid, Problem, TooLarge, UnreadableFile
+from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext, _image, _raster, _xml, register
+from app.formats._choice import the_one
+from app.formats._text import DEGREES, METRES
+from app.model.frame import MAX_METRES, is_writable
+from app.model.geodesy import WGS84, crs_bounds
+from app.model.imagery import LOCAL, USUAL_COLOURS, Affine, Picture, displayed, placed
+from app.model.layers import Layers, PartKey
+from app.model.resampling import resampled
+from app.parameters import parameter
+
+NAME = "satellite"
+TIFF_ENDS = (".tif", ".tiff")
+IMAGE_ENDS = (".png", ".jpg", ".jpeg", ".bmp", *TIFF_ENDS)
+WORLD_ENDS = {
+    ".pgw": (".png",),
+    ".pngw": (".png",),
+    ".jgw": (".jpg", ".jpeg"),
+    ".jpgw": (".jpg", ".jpeg"),
+    ".jpegw": (".jpeg", ".jpg"),
+    ".bpw": (".bmp",),
+    ".bmpw": (".bmp",),
+    ".tfw": TIFF_ENDS,
+    ".tifw": TIFF_ENDS,
+    ".tiffw": TIFF_ENDS,
+    ".wld": IMAGE_ENDS,
+}
+"""A world file's ending -> those of its picture."""
+
+MAX_WORLD = 4096
+MAX_SIDECAR = 2**20
+DEGREE_PIXEL = 2e-4
+"""Degrees. Pixels that would be larger on earth (20 m) are no degrees: a plan in metres has 0.001 to 1 a pixel."""
+
+SUPPLY = (
+    "a picture does not say where it lies: add a world file (.pgw, .jgw, .tfw), or the option corners=lat,lon,… of two "
+    "opposite or all four corners, or, for a floor plan, metres_per_pixel with origin and yaw"
+)
+_CRS = re.compile(r"(EPSG|ESRI|IAU_\d{4}):\d{1,7}|OGC:CRS84", re.IGNORECASE)
+_NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d+)?|[-+]?(nan|inf(inity)?)", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """Where a picture lies that does not say it itself."""
+
+    crs: str | None = parameter(
+        None, "CRS of a picture or world file that names none: EPSG:<number>, wgs84 (longitude, latitude) or local"
+    )
+    corners: tuple[float, ...] | None = parameter(
+        None,
+        "lat,lon of two opposite corners, or of all four: upper left, upper right, lower right, lower left, "
+        "for a picture that does not say where it lies",
+    )
+    metres_per_pixel: float | None = parameter(
+        None,
+        "scale of a floor plan that does not say where it lies: size of a pixel",
+        minimum=1e-5,
+        maximum=1e4,
+        unit="m",
+    )
+    origin: tuple[float, float] = parameter(
+        (0.0, 0.0), "x,y of a floor plan's lower left corner in the local frame", unit="m"
+    )
+    yaw: float = parameter(0.0, "how far a floor plan is turned counter-clockwise round its origin", unit="rad")
+    picture: str | None = parameter(None, "name to store the picture under; default: that of its file")
+    file: str | None = parameter(None, "which file the options place, where several pictures are uploaded")
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """Which picture, and how it is written."""
+
+    picture: str | None = parameter(None, "name of the picture; default: satellite, else the only one")
+    level: str | None = parameter(None, "level of the picture; default: the one it is on")
+    file_type: Literal["tif", "png"] | None = parameter(
+        None, "tif: a cloud optimized GeoTIFF with everything (default); png: 8 bit with a world file"
+    )
+    crs: Literal["source", "local", "wgs84"] = parameter(
+        "source", "source: its own pixels and CRS; local or wgs84: resampled to metres of the local frame or to degrees"
+    )
+    resolution: float | None = parameter(
+        None, "resample to this size of a pixel, in metres or degrees of the CRS", minimum=1e-9, maximum=1e6
+    )
+    resampling: Literal["nearest", "bilinear", "cubic"] | None = parameter(
+        None, "how a value between pixels is made; default: bilinear, nearest for palettes"
+    )
+
+
+# --- telling ------------------------------------------------------------------------------------------------------
+def detect(name: str, data: bytes) -> bool:
+    """A GeoTIFF, or a world file. A picture alone may be of anything."""
+    end = _world_end(name)
+    if end is None:
+        return _raster.is_georeferenced(data)
+    if len(data) > MAX_WORLD or b"\0" in data:
+        return False
+    return end != ".wld" or (len(data.split()) >= 6 and all(map(_NUMBER.fullmatch, data.split()[:6])))
+
+
+def yields(name: str) -> bool:
+    """A world file only speaks for its picture."""
+    return _world_end(name) is not None
+
+
+def lacking(name: str, data: bytes) -> str:
+    """What to add to a picture that does not say where it lies."""
+    del name
+    return SUPPLY if _is_picture(data) and not _raster.is_georeferenced(data) else ""
+
+
+def _is_picture(data: bytes) -> bool:
+    return _image.kind_of(data) in ("png", "jpeg", "bmp") or _raster.is_tiff(data)
+
+
+def _world_end(name: str) -> str | None:
+    end = name.rpartition("/")[2].lower().rpartition(".")
+    return "." + end[2] if end[1] and "." + end[2] in WORLD_ENDS else None
+
+
+def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
+    """Of a world file its picture, of a picture its world file; with the .prj and .aux.xml beside the two."""
+    del data
+    known: dict[str, str] = {}
+    for name in names:
+        known.setdefault(name.lower(), name)
+    lower = main.lower()
+    stem = lower.rpartition(".")[0]
+    end = _world_end(main)
+    if end is not None:
+        picture = next((stem + e for e in WORLD_ENDS[end] if stem + e in known), None)
+        wanted = [picture] if picture else []
+    else:
+        picture = lower
+        mine = [w for w, ends in WORLD_ENDS.items() if lower.endswith(ends)]
+        wanted = [world for w in mine for world in (stem + w, lower + "w") if world in known][:1]
+    wanted += [stem + ".prj", stem + ".aux.xml"] + ([picture + ".aux.xml"] if picture else [])
+    return [known[n] for n in dict.fromkeys(wanted) if n in known and known[n] != main]
+
+
+# --- reading ------------------------------------------------------------------------------------------------------
+def read(files: Files, context: ReadContext) -> Layers:
+    """One picture. Raises UnreadableFile (with file and reason), TooLarge, or Invalid for options that cannot be."""
+    main = context.main or next(iter(files))
+    options = context.options if isinstance(context.options, ReadOptions) else ReadOptions()
+    _check_options(options)
+    world = next((n for n in files if _world_end(n) is not None), None)
+    image = main if _world_end(main) is None else next((n for n in files if _is_picture(files[n])), None)
+    if image is None:
+        stem, end = main.rpartition(".")[0], WORLD_ENDS[_world_end(main) or ".wld"]
+        reason = f"the picture of this world file is not in the upload: add {stem.rpartition('/')[2]}{end[0]} beside it"
+        raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main)])
+    if not _is_picture(files[image]):
+        reason = "its first bytes are not those of a TIFF, PNG, JPEG or BMP picture"
+        raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image)])
+    if not context.wants("imagery"):
+        return Layers()
+    try:
+        raster = _decoded(files[image], context.limits)
+    except (UnreadableFile, TooLarge) as error:
+        raise type(error)(f"{image}: {error.detail}", [Problem(error.detail, image)]) from error
+    for doubt in raster.doubts:
+        context.warn(doubt, file=image)
+    said = raster.crs or _sidecar_crs(files, context)
+    transform, crs = _place(replace(raster, crs=said), image, world, files, options, context)
+    try:
+        picture = Picture(raster.pixels, transform, crs, raster.properties)
+    except Invalid as error:
+        where = world if world is not None and raster.transform is None else image
+        raise UnreadableFile(f"{where}: {error.detail}", [Problem(error.detail, where)]) from error
+    _check_place(picture, image)
+    name = options.picture or image.rpartition("/")[2].rpartition(".")[0]
+    if not name or len(name) > 256 or not is_writable(name):
+        name = NAME
+    return Layers({PartKey("imagery", context.level, name): picture})
+
+
+def _decoded(data: bytes, limits: Limits) -> _raster.Raster:
+    if _raster.is_tiff(data):
+        return _raster.read_tiff(data, limits)
+    image = _image.read_image(data, limits)
+    if image.mode.startswith("I"):
+        pixels = np.asarray(image).astype(np.uint16)[..., None]
+    else:
+        clear = "transparency" in image.info or image.mode in ("LA", "PA", "RGBA", "La", "RGBa")
+        grey = image.mode in ("1", "L", "LA", "La")
+        mode = ("LA" if clear else "L") if grey else ("RGBA" if clear else "RGB")
+        if image.mode != mode:
+            if "transparency" in image.info and mode == "LA":
+                image = image.convert("RGBA")
+            image = image.convert(mode)
+        pixels = np.asarray(image)
+        pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    bands = [{"colour": colour} for colour in USUAL_COLOURS[pixels.shape[2]]]
+    return _raster.Raster(pixels, None, None, {"bands": bands})
+
+
+def _check_options(options: ReadOptions) -> None:
+    problems = []
+    if options.crs is not None and options.crs.lower() not in (LOCAL, "wgs84") and not _CRS.fullmatch(options.crs):
+        problems.append(Problem(f"crs must be EPSG:<number>, wgs84 or local, got {options.crs[:80]!r}", where="crs"))
+    corners = options.corners
+    if corners is not None:
+        if len(corners) not in (4, 8):
+            reason = f"corners must be lat,lon of two or four corners (4 or 8 numbers), got {len(corners)} numbers"
+            problems.append(Problem(reason, where="corners"))
+        elif any(abs(v) > (180.0 if k % 2 else 90.0) for k, v in enumerate(corners)):
+            reason = "corners are latitude (-90 to 90) and longitude (-180 to 180) by turns, degrees"
+            problems.append(Problem(reason, where="corners"))
+        if options.metres_per_pixel is not None:
+            reason = "a picture is placed by its corners or by metres_per_pixel, not by both"
+            problems.append(Problem(reason, where="metres_per_pixel"))
+    if any(abs(v) > MAX_METRES for v in options.origin):
+        problems.append(Problem(f"origin must be within ±{MAX_METRES:g} m", where="origin"))
+    if problems:
+        raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
+
+
+def _place(
+    raster: _raster.Raster, image: str, world: str | None, files: Files, options: ReadOptions, context: ReadContext
+) -> tuple[Affine, str]:
+    """Where the picture lies: what it says itself, else its world file, else the options."""
+    height, width = raster.pixels.shape[:2]
+    own, teller = raster.transform, image
+    if own is not None and world is not None:
+        context.warn("the world file is not used: the picture says itself where it lies", file=world)
+    elif own is None and world is not None:
+        own, teller = _read_world(files[world], world), world
+    asked = "corners" if options.corners else "metres_per_pixel" if options.metres_per_pixel else None
+    if own is not None:
+        if asked:
+            context.warn(
+                f"the option {asked} is not used: {teller} says where the picture lies", file=image, where=asked
+            )
+        return own, _crs_of(own, raster, teller, options, context)
+    if options.crs is not None and asked:
+        reason = (
+            "corners are latitude and longitude" if asked == "corners" else "metres_per_pixel is of the local frame"
+        )
+        context.warn(f"the option crs is not used: {reason}", file=image, where="crs")
+    if options.corners is not None:
+        return _from_corners(options.corners, width, height, image, context), WGS84
+    if options.metres_per_pixel is not None:
+        m, (x, y) = options.metres_per_pixel, options.origin
+        cos, sin = m * math.cos(options.yaw), m * math.sin(options.yaw)
+        return (cos, sin, x - sin * height, sin, -cos, y + cos * height), LOCAL
+    raise UnreadableFile(f"{image}: {SUPPLY}", [Problem(SUPPLY, image)])
+
+
+def _crs_of(transform: Affine, raster: _raster.Raster, teller: str, options: ReadOptions, context: ReadContext) -> str:
+    asked = options.crs
+    if raster.crs is not None:
+        if asked is not None:
+            context.warn("the option crs is not used: the picture names its own", file=teller, where="crs")
+        return raster.crs
+    if asked is not None:
+        return {"wgs84": WGS84, LOCAL: LOCAL}.get(asked.lower(), asked.upper())
+    if _like_degrees(transform, raster.pixels.shape[1], raster.pixels.shape[0]):
+        context.warn(
+            "it names no CRS: its numbers are taken for degrees (longitude, latitude on WGS 84); if they are not, say "
+            "crs=EPSG:<number> or crs=local",
+            file=teller,
+        )
+        return WGS84
+    context.warn(
+        "it names no CRS: its numbers are taken for metres of the local frame; if they are not, say crs=EPSG:<number>",
+        file=teller,
+    )
+    return LOCAL
+
+
+def _like_degrees(transform: Affine, width: int, height: int) -> bool:
+    a, b, _, d, e, _ = transform
+    ends = placed(transform, np.array([0.0, width, width, 0.0]), np.array([0.0, 0.0, height, height]))
+    small = max(math.hypot(a, d), math.hypot(b, e)) <= DEGREE_PIXEL
+    return small and bool(np.abs(ends[:, 0]).max() <= 180.0 and np.abs(ends[:, 1]).max() <= 90.0)
+
+
+def _read_world(data: bytes, name: str) -> Affine:
+    """A world file's six numbers, from the centre of the first pixel to its outer corner."""
+    words = data.split()
+    wrong = next((k for k, word in enumerate(words[:6]) if not _NUMBER.fullmatch(word)), None)
+    if len(words) != 6 or wrong is not None:
+        found = f"{len(words)} words" if wrong is None else repr(words[wrong][:40].decode("latin1"))
+        reason = f"a world file has six lines of one number each (with a point), found {found}"
+        raise UnreadableFile(f"{name}: {reason}", [Problem(reason, name, None if wrong is None else wrong + 1)])
+    numbers = [float(re.sub(rb"[dD]", b"e", word) if b"inf" not in word.lower() else word) for word in words]
+    wrong = next((k for k, v in enumerate(numbers) if not math.isfinite(v)), None)
+    if wrong is not None:
+        reason = f"a world file's numbers must be finite, got {numbers[wrong]}"
+        raise UnreadableFile(f"{name}: {reason}", [Problem(reason, name, wrong + 1)])
+    a, d, b, e, c, f = numbers
+    return (a, b, c - a / 2 - b / 2, d, e, f - d / 2 - e / 2)
+
+
+def _from_corners(corners: Sequence[float], width: int, height: int, image: str, context: ReadContext) -> Affine:
+    """Longitude and latitude over the picture, from (latitude, longitude) of its corners."""
+    latitude, longitude = corners[0::2], corners[1::2]
+    if len(latitude) == 2:
+        west, east = sorted(longitude)
+        south, north = sorted(latitude)
+        if east - west > 180.0:
+            west, east = east, west + 360.0
+        return ((east - west) / width, 0.0, west, 0.0, (south - north) / height, north)
+    if max(longitude) - min(longitude) > 180.0:
+        longitude = [v + 360.0 if v < 0.0 else v for v in longitude]
+    ends = ((0.0, 0.0), (width, 0.0), (width, height), (0.0, height))
+    found = _raster.fitted([(u, v, x, y) for (u, v), x, y in zip(ends, longitude, latitude, strict=True)])
+    if found is None or not math.isfinite(found[1]):
+        reason = "the corners lie on one line"
+        raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image, where="corners")])
+    transform, off = found
+    if off > 0.02 * math.hypot(width, height):
+        reason = (
+            f"the corners are no parallelogram ({off:.0f} pixels off): give them as upper left, upper right, lower "
+            "right, lower left, each as latitude,longitude"
+        )
+        raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image, where="corners")])
+    if off > 0.5:
+        context.warn(f"the corners are {off:.1f} pixels off the nearest parallelogram, which is taken", file=image)
+    return transform
+
+
+def _sidecar_crs(files: Files, context: ReadContext) -> str | None:
+    """The CRS of a .prj or .aux.xml beside a picture."""
+    for name in sorted(files):
+        lower, data = name.lower(), files[name]
+        if not lower.endswith((".prj", ".aux.xml")):
+            continue
+        if len(data) > MAX_SIDECAR:
+            raise TooLarge(f"{name} has {len(data)} bytes; the limit is {MAX_SIDECAR}", [Problem("too large", name)])
+        try:
+            if lower.endswith(".prj"):
+                text: str | None = data.decode("utf-8-sig")
+            else:
+                text = _xml.parse(data, context.limits).findtext(".//SRS")
+            if text and text.strip():
+                return _raster.crs_from_wkt(text)
+        except (UnreadableFile, UnicodeError) as error:
+            reason = error.detail if isinstance(error, UnreadableFile) else "it is not UTF-8 text"
+            raise UnreadableFile(f"{name}: {reason}", [Problem(reason, name)]) from error
+    return None
+
+
+def _check_place(picture: Picture, image: str) -> None:
+    """Refuse what lies nowhere: beyond the local frame, or where PROJ knows no place on earth."""
+    ends = picture.outline()
+    if picture.crs == LOCAL:
+        if not (np.abs(ends) <= MAX_METRES).all():
+            reason = f"it reaches beyond ±{MAX_METRES:g} m of the local frame: say crs=EPSG:<number>"
+            raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image)])
+        return
+    if not np.isfinite(ends).all() or crs_bounds(picture.crs, ends) is None:
+        name = picture.crs if len(picture.crs) <= 40 else "its CRS"
+        reason = f"{name} places it nowhere on earth: say another with crs=EPSG:<number>, or crs=local"
+        raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image, where="crs")])
+
+
+# --- writing ------------------------------------------------------------------------------------------------------
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``satellite.tif``, or ``satellite.png`` with its world file. Raises MissingLayer, NotFound, Ambiguous,
+    MissingDatum, or Invalid for a grid that cannot be."""
+    options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
+    pictures = {k: p for k, p in layers.of("imagery").items() if isinstance(p, Picture)}
+    key = choose(sorted(pictures), options)[0]
+    picture = pictures[key]
+    crs = {"source": picture.crs, "local": LOCAL, "wgs84": WGS84}[options.crs]
+    if options.crs != "source" or options.resolution is not None:
+        made = resampled(picture, layers.frame, crs=crs, resolution=options.resolution, method=options.resampling)
+        if made is not picture:
+            picture = replace(made, properties=_without_statistics(made.properties))
+    elif options.resampling is not None:
+        raise Invalid("resampling only says how crs=local, crs=wgs84 or a resolution are made: ask for one of them")
+    stem = re.sub(r"[/\\\x00-\x1f]|(?<=^.):", "_", (options.picture or NAME).lstrip(".")) or NAME
+    named: str | None = picture.crs
+    if picture.crs == LOCAL:
+        named = None
+        if options.crs == "local" and layers.frame is not None and layers.frame.datum.heading == 0.0:
+            named = layers.frame.crs
+    if options.file_type == "png":
+        return _write_png(picture, named, stem, context)
+    if named is None:
+        context.warn(
+            "its coordinates are metres of the local frame, which it cannot name as a CRS; "
+            "crs=wgs84 places it on earth where there is a datum",
+            file=f"{stem}.tif",
+        )
+    tags = _tags(picture)
+    if named is None:
+        tags[_raster.OWN_TAG] = LOCAL
+    credit = [*picture.attribution, *context.attribution]
+    if credit:
+        tags.setdefault("TIFFTAG_COPYRIGHT", "; ".join(dict.fromkeys(credit)))
+    return {f"{stem}.tif": _raster.write_cog(picture, named, tags)}
+
+
+def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
+    """The named picture; else ``satellite``, else the only one; on its level, else on the ground, else the only one."""
+    supply = "upload one (a GeoTIFF, or a PNG with its world file)"
+    return the_one(
+        keys, "imagery", options.picture, options.level, what="picture", option="picture", supply=supply, usual=NAME
+    )
+
+
+def by_file(name: str) -> dict[str, str]:
+    """``satellite.png`` and ``satellite.pgw`` ask for PNG; ``plan.tif`` for the picture ``plan``, too."""
+    lower = name.lower()
+    for end, kind in ((".png.aux.xml", "png"), (".png", "png"), (".pgw", "png"), (".tif", "tif")):
+        if lower.endswith(end) and len(name) > len(end):
+            stem = name[: -len(end)]
+            return {"file_type": kind, **({} if stem == NAME else {"picture": stem})}
+    return {}
+
+
+def _tags(picture: Picture) -> dict[str, str]:
+    own = picture.properties.get(NAME)
+    tags = own.get("tags") if isinstance(own, Mapping) else None
+    return {str(k): str(v) for k, v in tags.items()} if isinstance(tags, Mapping) else {}
+
+
+def _without_statistics(properties: Mapping[str, Any]) -> dict[str, Any]:
+    """Of resampled bands: their stated statistics hold no longer."""
+    bands = []
+    for band in properties.get("bands", ()):
+        own = band.get(NAME) if isinstance(band, Mapping) else None
+        if isinstance(own, Mapping) and isinstance(own.get("tags"), Mapping):
+            kept = {k: v for k, v in own["tags"].items() if not str(k).startswith("STATISTICS_")}
+            bands.append({**band, NAME: {**own, "tags": kept}})
+        else:
+            bands.append(band)
+    return {**properties, "bands": bands} if bands else dict(properties)
+
+
+def _write_png(picture: Picture, crs: str | None, stem: str, context: WriteContext) -> dict[str, bytes]:
+    height, width, count = picture.pixels.shape
+    pixels = displayed(picture)
+    if picture.pixels.dtype != np.uint8:
+        why = f"PNG holds 8 bit here: {picture.pixels.dtype} was stretched to 0…255; file_type=tif keeps the values"
+        context.drop("pixel values", height * width, why)
+    colours = picture.colours
+    shown = 3 if {"red", "green", "blue"} <= set(colours) else 1
+    extra = count - shown - any(c in ("alpha", "mask") for c in colours)
+    context.drop("bands", extra, "PNG holds grey or red, green and blue with transparency; file_type=tif keeps all")
+    context.drop("tags", len(_tags(picture)), "they are the GeoTIFF's own; file_type=tif keeps them")
+    a, b, c, d, e, f = picture.transform
+    digits = METRES if crs is None or abs(a) + abs(e) > 0.1 else DEGREES
+    numbers = [*map(_exact, (a, d, b, e)), _rounded(c + a / 2 + b / 2, digits), _rounded(f + d / 2 + e / 2, digits)]
+    out = {f"{stem}.png": _image.encode_png(pixels), f"{stem}.pgw": ("\n".join(numbers) + "\n").encode()}
+    if crs is None:
+        context.warn(
+            "its coordinates are metres of the local frame; upload it again with crs=local", file=f"{stem}.pgw"
+        )
+    else:
+        out[f"{stem}.png.aux.xml"] = _aux_xml(crs)
+    return out
+
+
+def _exact(value: float) -> str:
+    return repr(float(value) + 0.0)
+
+
+def _rounded(value: float, digits: int) -> str:
+    """To a nanometre, or as far as 15 digits go: half a pixel forth and back leaves it the same."""
+    return repr(float(f"{round(value, digits):.15g}") + 0.0)
+
+
+def _aux_xml(crs: str) -> bytes:
+    """GDAL's file for what a picture cannot say itself: QGIS and GDAL take the CRS from it."""
+    from xml.sax.saxutils import escape
+
+    return f"<PAMDataset>\n  <SRS>{escape(_raster.wkt_of(crs))}</SRS>\n</PAMDataset>\n".encode()
+
+
+register(
+    Format(
+        name=NAME,
+        title="Georeferenced picture (GeoTIFF, or PNG and JPEG with a world file)",
+        files=("satellite.tif", "satellite.png", "satellite.pgw"),
+        media_types=("image/tiff", "image/png", "text/plain"),
+        carries=frozenset({"imagery"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs((frozenset({"imagery"}),)),
+        companions=companions,
+        read_options=ReadOptions,
+        write_options=WriteOptions,
+        extensions=IMAGE_ENDS,
+        choose=choose,
+        by_file=by_file,
+        yields=yields,
+        lacking=lacking,
+        completing=frozenset({"corners", "metres_per_pixel"}),
+    )
+)

@@ -1,0 +1,71 @@
+"""GDAL, as pictures use it: in one thread, in memory, on pixels where they are. The only module that sets it up."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+CACHE = 64 * 2**20
+"""Bytes of decoded blocks that GDAL keeps."""
+
+DATA_TYPES = {
+    "uint8": "Byte",
+    "int8": "Int8",
+    "uint16": "UInt16",
+    "int16": "Int16",
+    "uint32": "UInt32",
+    "int32": "Int32",
+    "uint64": "UInt64",
+    "int64": "Int64",
+    "float32": "Float32",
+    "float64": "Float64",
+}
+"""NumPy's names of the types of pixels -> GDAL's."""
+
+
+@contextlib.contextmanager
+def gdal() -> Iterator[Any]:
+    """GDAL with a small cache, deaf to files beside the one it is given. Gives rasterio, which is slow to import."""
+    import rasterio  # type: ignore[import-untyped]
+
+    logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # what it has to say is raised, too
+    settings = {
+        "GDAL_CACHEMAX": CACHE,
+        "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
+        "GDAL_MEM_ENABLE_OPEN": "YES",
+        "GDAL_NUM_THREADS": "1",
+        "GDAL_PAM_ENABLED": "NO",
+        "GDAL_TIFF_INTERNAL_MASK": "YES",
+    }
+    with rasterio.Env(**settings), warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        yield rasterio
+
+
+def native(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Pixels as GDAL can read them: the same ones where possible, else a copy (truth values become 0 and 1)."""
+    if pixels.dtype == np.bool_:
+        pixels = pixels.view(np.uint8)
+    elif pixels.dtype == np.float16:
+        pixels = pixels.astype(np.float32)
+    if not pixels.dtype.isnative or min(pixels.strides) < 0:
+        pixels = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("="))
+    return pixels
+
+
+def opened(rasterio: Any, pixels: NDArray[Any], bands: int, *, described: bool = False) -> Any:
+    """A dataset of the first bands of ``native`` pixels [height, width, bands], which are not copied: they must outlive
+    it. described: it takes a place, colours, tags and a mask; the pixels themselves may not be written."""
+    height, width, _ = pixels.shape
+    row, column, band = pixels.strides
+    name = (
+        f"MEM:::DATAPOINTER={pixels.__array_interface__['data'][0]},PIXELS={width},LINES={height},BANDS={bands},"
+        f"DATATYPE={DATA_TYPES[pixels.dtype.name]},PIXELOFFSET={column},LINEOFFSET={row},BANDOFFSET={band}"
+    )
+    return rasterio.open(name, "r+" if described else "r", driver="MEM")

@@ -1,0 +1,189 @@
+"""A picture in any CRS -> the same place on another grid: north up, square pixels, in the local frame or in a CRS.
+
+Stored pictures keep their pixels and their grid; whoever needs them elsewhere resamples them here, on use. Every target
+pixel is looked up through PROJ, to a millionth of a pixel, so that nothing is approximated but values between pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import Invalid, MissingDatum
+from app.model.frame import MAX_METRES
+from app.model.gdal import gdal, native, opened
+from app.model.geodesy import WGS84, LocalFrame, between
+from app.model.imagery import CLEAR, LOCAL, Affine, Picture, placed
+
+Method = Literal["nearest", "bilinear", "cubic"]
+TOLERANCE = 1e-6
+"""Pixels of the source by which the place of a pixel may be off; GDAL takes no 0."""
+
+STEPS = 64
+"""Points on each side of a picture by which its extent in the target is found."""
+
+MOST_PIXELS = 2**28
+_NO_CRS = "EPSG:3857"
+"""Stands for the local frame on both sides where neither is placed on earth: a CRS to itself is no transformation."""
+
+
+def resampled(
+    picture: Picture,
+    frame: LocalFrame | None = None,
+    *,
+    crs: str = LOCAL,
+    resolution: float | None = None,
+    method: Method | None = None,
+    most_pixels: int = MOST_PIXELS,
+) -> Picture:
+    """The picture on a grid of ``crs`` (``local``: metres of ``frame``; else a name that PROJ knows).
+
+    The grid's rows run along x, its columns against y, its pixels are squares of ``resolution`` (metres or degrees of
+    that CRS; default: as many pixels as the picture has on its area) and its upper left corner is a whole multiple of
+    it. method: how a value between pixels is made; default: ``bilinear``, ``nearest`` for palettes and truth values.
+    Outside of the picture stands its no-data value, NaN for floats without one; else a further band says so
+    (``alpha`` for 8 bit, ``mask`` for others). A picture that lies on such a grid already is returned as it is.
+
+    Raises MissingDatum where a datum would be needed, Invalid where there is no way, or for too many pixels.
+    """
+    if frame is None and (picture.crs == LOCAL) != (crs == LOCAL):
+        raise MissingDatum('the picture can only be placed with a datum: PATCH the environment with {"datum": {…}}')
+    if picture.crs == crs and resolution is None and _is_upright(picture.transform):
+        return picture
+    target, back = _placed_in(crs, frame)
+    source, forth = _placed_in(picture.crs, frame)
+    if picture.crs == LOCAL and crs == LOCAL:
+        source = target = _NO_CRS
+        back = forth = (1.0, 0.0, 0.0, 1.0)
+    base = _turned(picture.transform, forth)
+
+    def to_target(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return _unturned(points if source == target else between(source, target, points), back)
+
+    height, width = picture.pixels.shape[:2]
+    outline = to_target(_through(picture.outline(STEPS), forth))
+    if not np.isfinite(outline).all() or (crs == LOCAL and np.abs(outline).max() > MAX_METRES):
+        raise Invalid(
+            "the picture reaches places that the target cannot say: it is too large, or too far from the datum"
+        )
+    if resolution is None:
+        u, v = width / 2, height / 2
+        near = placed(base, np.array([u, u + 1, u]), np.array([v, v, v + 1]))
+        p, q, r = to_target(near)
+        area = abs((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))
+        resolution = float(f"{math.sqrt(area):.9g}")
+    if not (math.isfinite(resolution) and resolution > 0.0):
+        raise Invalid("the picture has no size in the target")
+    low = np.floor(outline.min(axis=0) / resolution + 1e-6)
+    high = np.maximum(np.ceil(outline.max(axis=0) / resolution - 1e-6), low + 1)
+    columns, rows = (float(n) for n in high - low)
+    if columns * rows > most_pixels:
+        raise Invalid(
+            f"the picture would have {columns:.0f} × {rows:.0f} pixels; at most {most_pixels} are made: ask for a "
+            "coarser resolution"
+        )
+    grid = (resolution, 0.0, float(low[0]) * resolution, 0.0, -resolution, float(high[1]) * resolution)
+    shape = (int(rows), int(columns))
+    pixels, properties = _warped(picture, method, shape, base, source, _turned(grid, back), target)
+    return replace(picture, pixels=pixels, transform=grid, crs=crs, properties=properties)
+
+
+def _is_upright(transform: Affine) -> bool:
+    a, b, _, d, e, _ = transform
+    return b == 0.0 and d == 0.0 and a > 0.0 and abs(a + e) <= 1e-12 * a
+
+
+Turn = tuple[float, float, float, float]
+
+
+def _placed_in(crs: str, frame: LocalFrame | None) -> tuple[str, Turn]:
+    """The CRS for PROJ, and how coordinates are turned into its own."""
+    if crs == LOCAL:
+        return (frame.crs, frame.from_local) if frame is not None else (_NO_CRS, (1.0, 0.0, 0.0, 1.0))
+    return crs, (1.0, 0.0, 0.0, 1.0)
+
+
+def _turned(transform: Affine, turn: Turn) -> Affine:
+    """A transform whose coordinates are turned further."""
+    a, b, c, d, e, f = transform
+    p, q, r, s = turn
+    return (p * a + q * d, p * b + q * e, p * c + q * f, r * a + s * d, r * b + s * e, r * c + s * f)
+
+
+def _through(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
+    p, q, r, s = turn
+    return np.column_stack([p * points[:, 0] + q * points[:, 1], r * points[:, 0] + s * points[:, 1]])
+
+
+def _unturned(points: NDArray[np.float64], turn: Turn) -> NDArray[np.float64]:
+    """Turned back: the inverse of a rotation is its transpose."""
+    p, q, r, s = turn
+    return _through(points, (p, r, q, s))
+
+
+def _warped(
+    picture: Picture,
+    method: Method | None,
+    shape: tuple[int, int],
+    transform: Affine,
+    source: str,
+    to_transform: Affine,
+    target: str,
+) -> tuple[NDArray[Any], Mapping[str, Any]]:
+    colours = picture.colours
+    if method is None:
+        method = "nearest" if "palette" in colours or picture.pixels.dtype == np.bool_ else "bilinear"
+    from rasterio.vrt import WarpedVRT  # type: ignore[import-untyped]
+
+    pixels = native(picture.pixels)
+    kind, nodata = pixels.dtype, picture.nodata
+    properties = dict(picture.properties)
+    count = len(colours)
+    clear = next((k for k, colour in enumerate(colours) if colour in CLEAR), None)
+    options: dict[str, Any] = {}
+    added = clear is None and nodata is None and kind.kind != "f"
+    if clear is not None:
+        most = _opaque(pixels[..., clear], colours[clear])
+        options = {"src_alpha": clear + 1, "dst_alpha": clear + 1, "SRC_ALPHA_MAX": most, "DST_ALPHA_MAX": most}
+    elif added:
+        most = 127 if kind == np.int8 else 255
+        options = {"add_alpha": True, "DST_ALPHA_MAX": most}
+        said = properties.get("bands") or [{"colour": colour} for colour in colours]
+        properties["bands"] = [*said, {"colour": "alpha" if kind == np.uint8 else "mask"}]
+    else:
+        if nodata is None:
+            nodata, properties["nodata"] = math.nan, "nan"
+        options = {"src_nodata": nodata, "nodata": nodata}
+    with gdal() as rasterio, opened(rasterio, pixels, count) as dataset:
+        matrix = rasterio.Affine
+        with WarpedVRT(
+            dataset,
+            src_crs=rasterio.crs.CRS.from_user_input(source),
+            src_transform=matrix(*transform),
+            crs=rasterio.crs.CRS.from_user_input(target),
+            transform=matrix(*to_transform),
+            height=shape[0],
+            width=shape[1],
+            resampling=rasterio.enums.Resampling[method],
+            tolerance=TOLERANCE,
+            warp_mem_limit=64,
+            **options,
+        ) as warped:
+            return np.moveaxis(warped.read(), 0, 2), properties
+
+
+def _opaque(band: NDArray[Any], colour: str) -> float:
+    """The value of an alpha or mask band that means fully opaque."""
+    if colour == "mask":
+        return float(max(1, band.max()))
+    return float(np.iinfo(band.dtype).max) if band.dtype.kind in "iu" else 1.0
+
+
+def to_wgs84(picture: Picture, frame: LocalFrame | None = None, **options: Any) -> Picture:
+    """``resampled`` on a grid of longitude and latitude."""
+    return resampled(picture, frame, crs=WGS84, **options)

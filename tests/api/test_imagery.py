@@ -1,0 +1,102 @@
+"""Pictures through HTTP: read and written in confined workers, answered as PNG, placed by options."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+
+import numpy as np
+from PIL import Image
+
+from app.formats import Group, ReadContext, WriteContext, get_format, read, write
+from app.formats.satellite import WriteOptions
+from app.model.imagery import Picture
+from app.model.layers import Layers, PartKey
+from tests.api.conftest import Api
+
+DATUM = {"latitude": 53.2686, "longitude": -0.5245}
+
+
+def geotiff(pixels: np.ndarray, crs: str = "EPSG:32630", **properties: object) -> bytes:
+    picture = Picture(pixels, (0.5, 0.0, 665000.0, 0.0, -0.5, 5905000.0), crs, properties)
+    context = WriteContext(options=WriteOptions())
+    return write(get_format("satellite"), Layers({PartKey("imagery"): picture}), context)["satellite.tif"]
+
+
+def picture_of(data: bytes) -> Picture:
+    (part,) = read(Group(get_format("satellite"), "a.tif", {"a.tif": data}), ReadContext()).parts.values()
+    assert isinstance(part, Picture)
+    return part
+
+
+def environment(api: Api, name: str, **more: object) -> str:
+    api.post("environments", {"name": name, **more})
+    return name
+
+
+def test_a_large_picture_goes_in_and_comes_out(api: Api, fresh: Callable[[], str]) -> None:
+    env = environment(api, fresh(), datum=DATUM)
+    rows, columns = np.mgrid[0:2500, 0:3000]
+    pixels = np.stack([rows % 251, columns % 241, (rows + columns) % 255], axis=-1).astype(np.uint8)
+    data = geotiff(pixels, attribution=["© Survey"], satellite={"tags": {"TIFFTAG_COPYRIGHT": "© Survey"}})
+    made = api.upload(env, {"field.tif": data}).json()
+    assert made["information"]["imagery"] == "raw"
+    assert made["warnings"] == []
+    about = api.get(f"environments/{env}/versions/latest/layers/imagery", headers={"Accept": "application/json"}).json()
+    assert (about["width"], about["height"], about["bands"], about["type"]) == (3000, 2500, 3, "uint8")
+    assert about["crs"] == "EPSG:32630"
+    assert about["attribution"] == ["© Survey"]
+    shown = Image.open(io.BytesIO(api.get(f"environments/{env}/versions/latest/layers/imagery").content))
+    assert np.array_equal(np.asarray(shown), pixels)
+    answer = api.get(f"/maps/{env}/satellite")
+    assert answer.headers["content-type"] == "image/tiff"
+    assert 'filename="satellite.tif"' in answer.headers["content-disposition"]
+    assert answer.content == api.get(f"/maps/{env}/satellite/satellite.tif").content == data
+    report = api.get(f"environments/{env}/versions/latest/reports/satellite").json()
+    assert report["attribution"] == ["© Survey"]
+    local = picture_of(api.get(f"/maps/{env}/satellite?crs=local").content)
+    assert local.transform[1] == local.transform[3] == 0.0
+
+
+def test_png_by_the_name_of_the_file(api: Api, fresh: Callable[[], str]) -> None:
+    env = environment(api, fresh())
+    api.upload(env, {"plan.tif": geotiff(np.full((4, 5, 3), 9, np.uint8))})
+    png = api.get(f"/maps/{env}/satellite/satellite.png")
+    assert png.headers["content-type"] == "image/png"
+    assert Image.open(io.BytesIO(png.content)).size == (5, 4)
+    world = api.get(f"/maps/{env}/satellite/satellite.pgw").text.split()
+    assert world == ["0.5", "0.0", "0.0", "-0.5", "665000.25", "5904999.75"]
+    assert api.get(f"/maps/{env}/satellite/plan.png").content == png.content
+    assert b"<SRS>" in api.get(f"/maps/{env}/satellite/satellite.png.aux.xml").content
+    api.problem("GET", f"/maps/{env}/satellite/other.tif", 404)
+
+
+def test_terrain_of_floats_is_shown_in_grey(api: Api, fresh: Callable[[], str]) -> None:
+    env = environment(api, fresh())
+    heights = np.array([[[10.0], [20.0]], [[-9999.0], [15.0]]], np.float32)
+    api.upload(env, {"dtm.tif": geotiff(heights, nodata=-9999)})
+    shown = Image.open(io.BytesIO(api.get(f"environments/{env}/versions/latest/layers/imagery").content))
+    assert np.asarray(shown).tolist() == [[[0, 255], [255, 255]], [[0, 0], [128, 255]]]
+    assert np.array_equal(picture_of(api.get(f"/maps/{env}/satellite").content).pixels, heights)
+
+
+def test_a_floor_plan_is_placed_by_options(api: Api, fresh: Callable[[], str]) -> None:
+    env = environment(api, fresh())
+    out = io.BytesIO()
+    Image.new("RGB", (40, 30), (1, 2, 3)).save(out, "PNG")
+    refused = api.upload(env, {"plan.png": out.getvalue()}, expect=422).json()
+    assert "metres_per_pixel" in refused["errors"][0]["problem"]
+    api.upload(env, {"plan.png": out.getvalue()}, metres_per_pixel="0.1", origin="1,2", yaw="0")
+    about = api.get(f"environments/{env}/versions/latest/layers/imagery", headers={"Accept": "application/json"}).json()
+    assert about["crs"] == "local"
+    assert about["transform"] == [0.1, 0.0, 1.0, 0.0, -0.1, 5.0]
+    api.problem("GET", f"/maps/{env}/satellite?crs=wgs84", 422)
+
+
+def test_damaged_tiles_are_422_with_the_reason(api: Api, fresh: Callable[[], str]) -> None:
+    env = environment(api, fresh())
+    data = geotiff(np.random.default_rng(0).integers(0, 255, (600, 600, 3), dtype=np.uint8))
+    refused = api.upload(env, {"a.tif": data[: len(data) * 2 // 3]}, expect=422).json()
+    assert refused["errors"][0]["file"] == "a.tif"
+    assert "vsimem" not in str(refused)
+    assert api.get(f"environments/{env}").json()["version"] == 0

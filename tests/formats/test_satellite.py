@@ -1,0 +1,681 @@
+"""Georeferenced pictures: samples against gdalinfo's words, real maps, world files, corners, floor plans, limits."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import shutil
+import struct
+import subprocess
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from app import bundle, formats
+from app.bundle import Hints, Known
+from app.errors import Ambiguous, Invalid, MissingDatum, MissingLayer, NotFound, TooLarge, UnreadableFile
+from app.formats import Group, Limits, ReadContext, WriteContext, _raster, get_format
+from app.formats.satellite import ReadOptions, WriteOptions, by_file, detect
+from app.model.frame import Datum
+from app.model.geodesy import crs_bounds
+from app.model.imagery import Picture, placed
+from app.model.layers import Layers, PartKey
+from app.model.resampling import resampled
+
+SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "satellite"
+FACTS: dict[str, Any] = json.loads((SAMPLES / "facts.json").read_text())
+Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
+LIMITS = Limits()
+UTM = "EPSG:32630"
+HERE = Datum(53.2686, -0.5245)
+
+
+def read(files: dict[str, bytes], main: str | None = None, **more: Any) -> tuple[Picture, ReadContext]:
+    options = more.pop("options", {})
+    context = ReadContext(options=ReadOptions(**options), **more)
+    main = main or next(iter(files))
+    layers = formats.read(Group(get_format("satellite"), main, files), context)
+    (part,) = layers.parts.values()
+    assert isinstance(part, Picture)
+    return part, context
+
+
+def written(picture: Picture, datum: Datum | None = None, **options: Any) -> tuple[dict[str, bytes], WriteContext]:
+    context = WriteContext(options=WriteOptions(**options))
+    layers = Layers({PartKey("imagery", name="a"): picture}, datum)
+    return formats.write(get_format("satellite"), layers, context), context
+
+
+def tif(picture: Picture, **options: Any) -> bytes:
+    return written(picture, **options)[0]["satellite.tif"]
+
+
+def image(shape: tuple[int, ...] = (3, 4, 3), kind: str = "PNG", seed: int = 1) -> bytes:
+    pixels = np.random.default_rng(seed).integers(0, 255, shape, dtype=np.uint8)
+    out = io.BytesIO()
+    Image.fromarray(pixels).save(out, kind)
+    return out.getvalue()
+
+
+def utm(shape: tuple[int, ...] = (3, 4, 3), kind: Any = np.uint8, **properties: Any) -> Picture:
+    values = np.arange(math.prod(shape)).reshape(shape) % 250
+    return Picture(values.astype(kind), (0.5, 0.0, 665000.0, 0.0, -0.5, 5905000.0), UTM, properties)
+
+
+def sample(name: str) -> dict[str, bytes]:
+    path = SAMPLES / name
+    folder = [path] if path.parent == SAMPLES else sorted(path.parent.iterdir())
+    return {p.name: p.read_bytes() for p in sorted(folder, key=lambda p: p != path)}
+
+
+def same_properties(a: Picture, b: Picture) -> bool:
+    return json.dumps(dict(a.properties), sort_keys=True) == json.dumps(dict(b.properties), sort_keys=True)
+
+
+def gdalinfo(path: Path) -> dict[str, Any]:
+    if shutil.which("gdalinfo") is None:
+        pytest.skip("gdalinfo is not installed")
+    done = subprocess.run(["gdalinfo", "-json", str(path)], capture_output=True, check=True, timeout=60)
+    assert b"rror" not in done.stderr, done.stderr
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
+
+
+# --- samples and real maps ----------------------------------------------------------------------------------------
+@pytest.mark.parametrize("name", [n for n in FACTS if n != "made"])
+def test_samples(name: str) -> None:
+    said = FACTS[name]
+    files = sample(name)
+    groups, rest = formats.group(files)
+    assert [g.format.name for g in groups] == ["satellite"]
+    assert rest == []
+    picture, _ = read(files, groups[0].main)
+    height, width, bands = picture.pixels.shape
+    assert [width, height] == said["size"]
+    assert (bands, picture.pixels.dtype.name, picture.crs) == (said["bands"], said["type"], said["crs"])
+    corners = placed(picture.transform, np.array([0.0, width]), np.array([0.0, height]))
+    assert np.abs(corners - [said["upper_left"], said["lower_right"]]).max() < 5.1e-4
+    if "nodata" in said:
+        assert picture.nodata == said["nodata"]
+    if "rows" in said:
+        assert picture.pixels[..., 0].tolist() == said["rows"]
+    if "pixel_row_2_column_3" in said:
+        assert picture.pixels[2, 3].tolist() == said["pixel_row_2_column_3"]
+
+
+def real(shared: Path, name: str) -> dict[str, bytes]:
+    path = shared / "data" / "geotiff" / name
+    return {path.name: path.read_bytes()}
+
+
+REAL = ("opengeos_dtm/dtm.tif", "rasterio/RGB.byte.tif", "rasterio/rgb-byte-tenth.tif", "rasterio/rotated.tif")
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_maps_hold_their_facts_and_come_back(
+    shared: Path, same: Same, facts_json: dict[str, Any], name: str, tmp_path: Path
+) -> None:
+    known = facts_json[f"geotiff/{name}"]["facts"]
+    files = real(shared, name)
+    picture, context = read(files)
+    height, width, _ = picture.pixels.shape
+    assert [width, height] == known["size"]
+    a, b, c, d, e, f = picture.transform
+    assert np.abs(np.array([c, a, b, f, d, e]) - known["geoTransform"]).max() < 1e-9
+    if known["epsg"]:
+        assert picture.crs == f"EPSG:{known['epsg']}"
+    if known["wgs84Extent"]:
+        box = crs_bounds(picture.crs, picture.outline())
+        ring = np.array(known["wgs84Extent"][0])
+        assert box is not None
+        assert np.abs(np.array(box) - [*ring.min(axis=0), *ring.max(axis=0)]).max() < 2e-7
+    else:
+        assert picture.crs == "local"
+        assert "names no CRS" in context.warnings[0].problem
+    back, _ = written(picture)
+    assert same("satellite", files, back) == []
+    (tmp_path / "satellite.tif").write_bytes(back["satellite.tif"])
+    told = gdalinfo(tmp_path / "satellite.tif")
+    assert told["size"] == known["size"]
+    assert np.abs(np.array(told["geoTransform"]) - known["geoTransform"]).max() < 1e-9
+    assert told["metadata"]["IMAGE_STRUCTURE"]["LAYOUT"] == "COG"
+    again, _ = read(back)
+    assert again.transform == picture.transform
+    assert again.crs == picture.crs
+    assert same_properties(again, picture)
+
+
+def test_damaged_tiles_are_refused_with_the_reason(shared: Path) -> None:
+    with pytest.raises(UnreadableFile, match=r"corrupt\.tif: .*row 512, col 0, tile 3") as caught:
+        read(real(shared, "rasterio/corrupt.tif"))
+    assert "vsimem" not in caught.value.detail
+    assert caught.value.problems[0].file == "corrupt.tif"
+
+
+def test_pictures_of_all_kinds_hold_their_facts(shared: Path, facts_json: dict[str, Any]) -> None:
+    """The real PNGs as floor plans: size, bands and transparency as counted by another tool."""
+    plans = [n for n, e in facts_json.items() if e["kind"] == "image" and n.endswith((".png", ".bmp"))]
+    assert len(plans) > 10
+    for name in plans:
+        known = facts_json[name]["facts"]
+        if known["width"] * known["height"] > 5_000_000:
+            continue
+        data = (shared / "data" / name).read_bytes()
+        picture, _ = read({"plan.png": data}, options={"metres_per_pixel": 0.05})
+        assert picture.pixels.shape[:2] == (known["height"], known["width"])
+        assert picture.pixels.shape[2] == {"L": 1, "RGB": 3, "RGBA": 4}[known["mode"]]
+        if "transparent_pixels" in known and known["has_alpha"]:
+            assert int((picture.pixels[..., 3] == 0).sum()) == known["transparent_pixels"]
+
+
+# --- GeoTIFF ------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    "kind", ["uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64"]
+)
+@pytest.mark.parametrize("bands", [1, 2, 3, 4, 5])
+def test_every_type_comes_back(kind: str, bands: int) -> None:
+    picture = utm((7, 5, bands), kind)
+    back, _ = read({"a.tif": tif(picture)})
+    assert back.pixels.dtype == kind
+    assert np.array_equal(back.pixels, picture.pixels)
+    assert back.colours == picture.colours
+    assert tif(back) == tif(picture)
+
+
+def test_what_a_tiff_says_besides_pixels_comes_back() -> None:
+    bands = [
+        {"colour": "gray", "description": "height", "unit": "m", "scale": 0.01, "offset": 100.0},
+        {"colour": "undefined", "satellite": {"tags": {"SENSOR": "a"}}},
+        {"colour": "mask"},
+    ]
+    tags = {"TIFFTAG_COPYRIGHT": "© A. Survey", "TIFFTAG_DATETIME": "2024:05:01 10:00:00", "AREA_OR_POINT": "Point"}
+    values = np.arange(24, dtype=np.int16).reshape(2, 4, 3)
+    values[..., 2] = [[255, 0, 255, 255], [0, 255, 255, 255]]
+    picture = Picture(
+        values,
+        (2.0, 0.0, 500000.0, 0.0, -2.0, 370000.0),
+        "EPSG:27700",
+        {"bands": bands, "attribution": ["© A. Survey"], "satellite": {"tags": tags}},
+    )
+    back, _ = read({"a.tif": tif(picture)})
+    assert np.array_equal(back.pixels, picture.pixels)
+    assert back.transform == picture.transform
+    assert same_properties(back, picture)
+    assert back.attribution == ("© A. Survey",)
+
+
+@pytest.mark.parametrize("value", [0, 255, 7])
+def test_no_data_of_whole_numbers(value: int) -> None:
+    back, _ = read({"a.tif": tif(utm(nodata=value))})
+    assert back.nodata == value
+    assert isinstance(back.properties["nodata"], int)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", -32768.5])
+def test_no_data_of_floats(value: Any) -> None:
+    back, _ = read({"a.tif": tif(utm(kind=np.float32, nodata=value))})
+    assert back.properties["nodata"] == value
+
+
+def test_no_data_that_no_pixel_can_have_is_left_out() -> None:
+    assert read({"a.tif": tif(utm(nodata=-9999))})[0].nodata is None
+
+
+def test_a_palette_comes_back_and_is_shown_in_colour() -> None:
+    palette = [[k, 255 - k, 7, 255] for k in range(256)]
+    picture = utm((3, 4, 1), bands=[{"colour": "palette"}], palette=palette)
+    back, _ = read({"a.tif": tif(picture)})
+    assert back.properties["palette"] == palette
+    shown = Image.open(io.BytesIO(written(back, file_type="png")[0]["satellite.png"])).convert("RGBA")
+    value = int(picture.pixels[2, 3, 0])
+    assert shown.getpixel((3, 2)) == (value, 255 - value, 7, 255)
+
+
+@pytest.mark.parametrize(
+    "crs",
+    [
+        "EPSG:4326",
+        "EPSG:3857",
+        "EPSG:27700",
+        'PROJCRS["mine",BASEGEOGCRS["WGS 84",DATUM["World Geodetic System 1984",ELLIPSOID["WGS 84",6378137,'
+        '298.257223563]]],CONVERSION["x",METHOD["Transverse Mercator",ID["EPSG",9807]],PARAMETER["Latitude of natural '
+        'origin",53.2,ANGLEUNIT["degree",0.0174532925199433]],PARAMETER["Longitude of natural origin",-0.5,ANGLEUNIT['
+        '"degree",0.0174532925199433]],PARAMETER["Scale factor at natural origin",1,SCALEUNIT["unity",1]],PARAMETER['
+        '"False easting",0,LENGTHUNIT["metre",1]],PARAMETER["False northing",0,LENGTHUNIT["metre",1]]],CS[Cartesian,2],'
+        'AXIS["e",east],AXIS["n",north],LENGTHUNIT["metre",1]]',
+    ],
+    ids=["degrees", "mercator", "british", "own"],
+)
+def test_a_crs_comes_back(crs: str) -> None:
+    picture = Picture(np.zeros((2, 2, 1), np.uint8), (1e-5, 0.0, -0.5, 0.0, -1e-5, 53.2), crs)
+    back, context = read({"a.tif": tif(picture)})
+    assert crs_bounds(back.crs, back.outline()) == pytest.approx(crs_bounds(crs, picture.outline()), abs=1e-11)
+    assert context.warnings == []
+    if crs.startswith("EPSG"):
+        assert back.crs == crs
+    assert tif(back) == tif(picture)
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [(0.05, 0.0, -3.0, 0.0, -0.05, 7.0), (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), (0.04, 0.03, 1.0, 0.03, -0.04, 2.0)],
+)
+def test_local_metres_come_back_without_a_doubt(transform: Any) -> None:
+    picture = Picture(np.ones((2, 3, 1), np.uint8), transform)
+    data = tif(picture)
+    assert detect("a.tif", data)
+    back, context = read({"a.tif": data})
+    assert (back.crs, back.transform, context.warnings) == ("local", transform, [])
+
+
+def test_a_tiff_without_a_crs_takes_the_option() -> None:
+    data = without_tag(tif(Picture(np.ones((2, 3, 1), np.uint8), (2.0, 0.0, 5e5, 0.0, -2.0, 4e5))))
+    assert read({"a.tif": data})[0].crs == "local"
+    picture, context = read({"a.tif": data}, options={"crs": "epsg:27700"})
+    assert picture.crs == "EPSG:27700"
+    assert context.warnings == []
+    with pytest.raises(UnreadableFile, match="nowhere on earth"):
+        read({"a.tif": data}, options={"crs": "EPSG:99999"})
+
+
+def without_tag(data: bytes) -> bytes:
+    """Our own tag, which says local, under another name of the same length."""
+    assert _raster.OWN_TAG.encode() in data
+    return data.replace(_raster.OWN_TAG.encode(), b"X" * len(_raster.OWN_TAG))
+
+
+def test_ground_control_points_place_a_tiff() -> None:
+    import rasterio
+    from rasterio.control import GroundControlPoint
+    from rasterio.io import MemoryFile
+
+    points = [
+        GroundControlPoint(row=r, col=c, x=1000.0 + 2 * c, y=500.0 - 2 * r) for r, c in ((0, 0), (0, 4), (3, 0), (3, 4))
+    ]
+    with MemoryFile() as file:
+        with file.open("GTiff", 4, 3, 1, dtype="uint8", gcps=points, crs="EPSG:27700") as out:
+            out.write(np.ones((1, 3, 4), np.uint8))
+        data = bytes(file.getbuffer())
+    assert rasterio.__version__
+    picture, _ = read({"a.tif": data})
+    assert picture.transform == pytest.approx((2.0, 0.0, 1000.0, 0.0, -2.0, 500.0))
+    assert picture.crs == "EPSG:27700"
+
+
+def test_of_several_pages_the_first_is_read_with_a_warning() -> None:
+    frames = [Image.new("L", (4, 3), shade) for shade in (10, 20, 30)]
+    out = io.BytesIO()
+    frames[0].save(out, "TIFF", save_all=True, append_images=frames[1:])
+    picture, context = read({"a.tif": out.getvalue(), "a.tfw": b"1 0 0 -1 1000 2000"})
+    assert set(picture.pixels.ravel().tolist()) == {10}
+    assert "3 pages" in context.warnings[0].problem
+
+
+# --- world files --------------------------------------------------------------------------------------------------
+def test_a_world_file_is_of_the_centre_of_the_first_pixel() -> None:
+    world = b"2\n0.5\n0.25\n-3\n100\n200\n"
+    picture, _ = read({"a.pgw": world, "a.png": image()}, options={"crs": "local"})
+    assert picture.transform == (2.0, 0.25, 98.875, 0.5, -3.0, 201.25)
+
+
+def test_numbers_like_degrees_are_degrees_and_others_metres() -> None:
+    degrees, context = read({"a.pgw": b"1e-5 0 0 -1e-5 -0.5 53.2", "a.png": image()})
+    assert degrees.crs == "EPSG:4326"
+    assert "taken for degrees" in context.warnings[0].problem
+    metres, context = read({"a.pgw": b"0.05 0 0 -0.05 -0.5 53.2", "a.png": image()})
+    assert metres.crs == "local"
+    assert "taken for metres of the local frame" in context.warnings[0].problem
+    assert read({"a.pgw": b"0.05 0 0 -0.05 -0.5 53.2", "a.png": image()}, options={"crs": UTM})[0].crs == UTM
+
+
+@pytest.mark.parametrize(
+    ("world", "picture"),
+    [
+        ("a.pgw", "a.png"),
+        ("a.jgw", "a.jpg"),
+        ("a.jgw", "a.jpeg"),
+        ("a.wld", "a.png"),
+        ("A.TFW", "a.TIF"),
+        ("x/a.pgw", "x/a.png"),
+    ],
+)
+def test_a_world_file_finds_its_picture(world: str, picture: str) -> None:
+    kind = {"png": "PNG", "tif": "TIFF"}.get(picture[-3:].lower(), "JPEG")
+    files = {picture: image(kind=kind), world: b"2\n0\n0\n-2\n665000\n5905000\n", "else.txt": b"?"}
+    told = bundle.read(files, Hints(options={"crs": UTM}), Known(), LIMITS)
+    assert [k.name for k in told.parts] == ["a"]
+    assert {n for n, use in told.files.items() if use.used} == {world, picture}
+
+
+def test_a_geotiff_is_believed_before_its_world_file() -> None:
+    files = {"a.tif": tif(utm()), "a.tfw": b"9 0 0 -9 9 9"}
+    told = bundle.read(files, Hints(), Known(), LIMITS)
+    (picture,) = told.parts.values()
+    assert isinstance(picture, Picture)
+    assert picture.transform == utm().transform
+    assert [w.file for w in told.warnings] == ["a.tfw"]
+    assert told.files["a.tfw"].used
+
+
+@pytest.mark.parametrize(
+    ("world", "line", "said"),
+    [
+        (b"1\n0\n0\nnan\n0\n0\n", 4, "finite"),
+        (b"1\n0\n0\n-1\ninf\n0\n", 5, "finite"),
+        (b"1\n0\n0\n-1e999\n0\n0\n", 4, "finite"),
+        (b"1,5\n0\n0\n-1\n0\n0\n", 1, "with a point"),
+        (b"1\n0\n0\n-1\n0\n", None, "six lines"),
+        (b"1\n0\n0\n-1\n0\n0\n7\n", None, "six lines"),
+        (b"0\n0\n0\n0\n0\n0\n", None, "singular"),
+        (b"1\n1\n1\n1\n0\n0\n", None, "singular"),
+        (b"1\n0\n0\n-1\n1e12\n0\n", None, "beyond"),
+    ],
+)
+def test_wrong_world_files_are_refused(world: bytes, line: int | None, said: str) -> None:
+    with pytest.raises(UnreadableFile, match=said) as caught:
+        read({"a.pgw": world, "a.png": image()})
+    assert caught.value.problems[0].line == line
+
+
+def test_a_world_file_without_its_picture_says_what_to_add() -> None:
+    with pytest.raises(UnreadableFile, match=r"add a\.png beside it"):
+        bundle.read({"a.pgw": b"1 0 0 -1 0 0"}, Hints(), Known(), LIMITS)
+
+
+def test_a_crs_stands_beside_the_picture() -> None:
+    wkt = _raster.wkt_of(UTM).encode()
+    world = b"2 0 0 -2 665000 5905000"
+    for name, body in (("a.prj", wkt), ("a.png.aux.xml", b"<PAMDataset><SRS>" + wkt + b"</SRS></PAMDataset>")):
+        files = {"a.png": image(), "a.pgw": world, name: body}
+        told = bundle.read(files, Hints(), Known(), LIMITS)
+        (picture,) = told.parts.values()
+        assert isinstance(picture, Picture)
+        assert picture.crs == UTM
+        assert told.warnings == []
+        assert all(use.used for use in told.files.values())
+
+
+@pytest.mark.parametrize(
+    ("name", "body"),
+    [
+        ("a.prj", b"not a CRS"),
+        ("a.prj", b"\xff\xfe\0"),
+        ("a.prj", b'PROJCS["x' + b"[" * 5000),
+        ("a.prj", b"x" * 2**17),
+        ("a.prj", b'GEOGCS["x",EXTENSION["PROJ4","+proj=longlat +nadgrids=/etc/passwd"]]'),
+        ("a.png.aux.xml", b"<!DOCTYPE a><PAMDataset><SRS>x</SRS></PAMDataset>"),
+        ("a.png.aux.xml", b"<PAMDataset><SRS>/etc/passwd</SRS></PAMDataset>"),
+    ],
+)
+def test_wrong_crs_files_are_refused_by_name(name: str, body: bytes) -> None:
+    with pytest.raises(UnreadableFile) as caught:
+        read({"a.pgw": b"2 0 0 -2 665000 5905000", "a.png": image(), name: body})
+    assert caught.value.problems[0].file == name
+
+
+# --- options ------------------------------------------------------------------------------------------------------
+def test_two_opposite_corners() -> None:
+    for corners in ((53.2, -0.6, 53.1, -0.5), (53.1, -0.6, 53.2, -0.5)):
+        picture, _ = read({"a.png": image((50, 100, 3))}, options={"corners": corners})
+        assert picture.transform == pytest.approx((0.001, 0.0, -0.6, 0.0, -0.002, 53.2), abs=1e-15)
+        assert picture.crs == "EPSG:4326"
+
+
+def test_four_corners_of_a_turned_picture() -> None:
+    ends = np.array([[-0.5, 53.2], [-0.4992, 53.2003], [-0.4994, 53.1999], [-0.5002, 53.1996]])
+    picture, context = read({"a.png": image((40, 80, 3))}, options={"corners": tuple(ends[:, ::-1].ravel().tolist())})
+    found = placed(picture.transform, np.array([0.0, 80.0, 80.0, 0.0]), np.array([0.0, 0.0, 40.0, 40.0]))
+    assert np.abs(found - ends).max() < 1e-12
+    assert context.warnings == []
+
+
+def test_corners_that_are_no_parallelogram() -> None:
+    nearly = (53.2, -0.5, 53.2, -0.49, 53.19, -0.49, 53.1904, -0.5)
+    _, context = read({"a.png": image((100, 100, 3))}, options={"corners": nearly})
+    assert "1.0 pixels off" in context.warnings[0].problem
+    crossed = (53.2, -0.5, 53.2, -0.49, 53.19, -0.5, 53.19, -0.49)
+    with pytest.raises(UnreadableFile, match="upper left, upper right, lower right, lower left"):
+        read({"a.png": image((100, 100, 3))}, options={"corners": crossed})
+
+
+def test_a_floor_plan_with_its_scale() -> None:
+    picture, _ = read(
+        {"plan.png": image((30, 40, 3))}, options={"metres_per_pixel": 0.1, "origin": (5.0, 6.0), "yaw": math.pi / 2}
+    )
+    assert picture.crs == "local"
+    # Turned a quarter to the left round its lower left corner: its right side points north, its upper side west.
+    found = placed(picture.transform, np.array([0.0, 40.0, 0.0]), np.array([30.0, 30.0, 0.0]))
+    assert np.abs(found - [[5.0, 6.0], [5.0, 10.0], [2.0, 6.0]]).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("options", "where"),
+    [
+        ({"corners": (1.0, 2.0, 3.0)}, "corners"),
+        ({"corners": (91.0, 0.0, 1.0, 1.0)}, "corners"),
+        ({"corners": (1.0, 0.0, 0.0, 1.0), "metres_per_pixel": 1.0}, "metres_per_pixel"),
+        ({"crs": "/etc/passwd"}, "crs"),
+        ({"crs": "+proj=longlat +nadgrids=/etc/passwd"}, "crs"),
+        ({"crs": "http://example.org/x"}, "crs"),
+        ({"metres_per_pixel": 1.0, "origin": (1e9, 0.0)}, "origin"),
+    ],
+)
+def test_wrong_options_are_refused_by_name(options: dict[str, Any], where: str) -> None:
+    with pytest.raises(UnreadableFile) as caught:
+        read({"a.png": image()}, options=options)
+    assert caught.value.problems[0].where == where
+
+
+def test_a_picture_alone_says_what_to_supply() -> None:
+    for hints in (Hints(), Hints("satellite")):
+        with pytest.raises(UnreadableFile, match=r"world file .*corners=.*metres_per_pixel") as caught:
+            bundle.read({"a.png": image()}, hints, Known(), LIMITS)
+        assert caught.value.problems[0].file == "a.png"
+        assert "corners=" in caught.value.problems[0].problem
+
+
+ROOM = (
+    b"image: map.png\nresolution: 0.5\norigin: [0.0, 0.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+)
+
+
+def test_in_a_folder_a_picture_without_a_place_stays_a_source_unless_it_is_given() -> None:
+    files = {
+        "config/location/satellite-auto.png": image(),
+        "config/metric/map/map.yaml": ROOM,
+        "config/metric/map/map.png": image((5, 5)),
+    }
+    told = bundle.read(files, Hints(), Known(), LIMITS)
+    assert [k.layer for k in told.parts] == ["occupancy"]
+    (warning,) = told.warnings
+    assert warning.file == "config/location/satellite-auto.png"
+    assert "kept as a source" in warning.problem
+    assert "corners=" in warning.problem
+    told = bundle.read(files, Hints(options={"corners": "53.2,-0.6,53.1,-0.5"}), Known(), LIMITS)
+    assert sorted(k.layer for k in told.parts) == ["imagery", "occupancy"]
+    assert told.files["config/location/satellite-auto.png"].format == "satellite"
+
+
+def test_of_several_pictures_the_options_place_the_one_that_is_named() -> None:
+    files = {"a.png": image(), "b.png": image(seed=2)}
+    options = {"metres_per_pixel": "0.5"}
+    for hints in (Hints(options=options), Hints("satellite", options=options)):
+        with pytest.raises(Invalid, match=r"file=….*a\.png, b\.png"):
+            bundle.read(files, hints, Known(), LIMITS)
+    told = bundle.read(files, Hints(options={**options, "file": "b.png", "picture": "roof"}), Known(), LIMITS)
+    assert [k.name for k in told.parts] == ["roof"]
+    assert {n for n, use in told.files.items() if use.used} == {"b.png"}
+    with pytest.raises(Invalid, match="no file"):
+        bundle.read(files, Hints(options={**options, "file": "c.png"}), Known(), LIMITS)
+
+
+def test_what_says_where_it_lies_is_not_moved_by_options() -> None:
+    picture, context = read({"a.tif": tif(utm())}, options={"metres_per_pixel": 1.0, "crs": "local"})
+    assert picture.transform == utm().transform
+    assert picture.crs == UTM
+    assert {w.where for w in context.warnings} == {"metres_per_pixel", "crs"}
+
+
+# --- writing ------------------------------------------------------------------------------------------------------
+def test_a_cog_has_tiles_and_overviews_and_gdal_takes_it(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(3).integers(0, 255, (1500, 1100, 3), dtype=np.uint8)
+    picture = Picture(pixels, (0.25, 0.0, 665000.0, 0.0, -0.25, 5905000.0), UTM)
+    data = tif(picture)
+    assert data == tif(picture), "no clock in it"
+    (tmp_path / "a.tif").write_bytes(data)
+    told = gdalinfo(tmp_path / "a.tif")
+    assert told["size"] == [1100, 1500]
+    assert told["geoTransform"] == [665000.0, 0.25, 0.0, 5905000.0, 0.0, -0.25]
+    assert 'ID["EPSG",32630]' in told["coordinateSystem"]["wkt"]
+    assert (
+        told["metadata"]["IMAGE_STRUCTURE"] | {"COMPRESSION": "DEFLATE", "PREDICTOR": "2", "LAYOUT": "COG"}
+        == (told["metadata"]["IMAGE_STRUCTURE"])
+    )
+    assert told["bands"][0]["block"] == [512, 512]
+    assert [o["size"] for o in told["bands"][0]["overviews"]] == [[550, 750], [275, 375]]
+    assert np.array_equal(read({"a.tif": data})[0].pixels, pixels)
+
+
+def test_credits_are_written_and_read() -> None:
+    context = WriteContext(attribution=("© Aerial Ltd", "CC BY 4.0"))
+    layers = Layers({PartKey("imagery"): utm()})
+    data = formats.write(get_format("satellite"), layers, context)["satellite.tif"]
+    assert read({"a.tif": data})[0].attribution == ("© Aerial Ltd; CC BY 4.0",)
+
+
+def test_png_with_world_file_as_gdal_reads_it(tmp_path: Path) -> None:
+    turned = Picture(utm().pixels, (0.4, 0.3, 665000.0, 0.3, -0.4, 5905000.0), UTM)
+    files, context = written(turned, file_type="png")
+    assert sorted(files) == ["satellite.pgw", "satellite.png", "satellite.png.aux.xml"]
+    assert context.dropped == []
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    told = gdalinfo(tmp_path / "satellite.png")
+    assert told["geoTransform"] == pytest.approx([665000.0, 0.4, 0.3, 5905000.0, 0.3, -0.4])
+    assert 'ID["EPSG",32630]' in told["coordinateSystem"]["wkt"]
+    back, _ = read(files, "satellite.pgw")
+    assert np.array_equal(back.pixels, turned.pixels)
+    assert back.crs == UTM
+    assert back.transform == pytest.approx(turned.transform, abs=2e-9)
+    assert written(back, file_type="png")[0] == files
+
+
+def test_png_of_floats_declares_what_is_lost() -> None:
+    values = np.array([[[10.0], [20.0]], [[15.0], [-9999.0]]], np.float32)
+    picture = Picture(values, utm().transform, UTM, {"nodata": -9999.0})
+    files, context = written(picture, file_type="png")
+    shown = np.asarray(Image.open(io.BytesIO(files["satellite.png"])))
+    assert shown.tolist() == [[[0, 255], [255, 255]], [[128, 255], [0, 0]]]
+    (drop,) = context.dropped
+    assert (drop["what"], drop["count"]) == ("pixel values", 4)
+    assert "file_type=tif" in drop["why"]
+    _, context = written(utm((3, 4, 6)), file_type="png")
+    assert [(d["what"], d["count"]) for d in context.dropped] == [("bands", 5)]
+
+
+def test_another_crs_on_request(tmp_path: Path) -> None:
+    picture = utm((40, 60, 3))
+    (tmp_path / "a.tif").write_bytes(written(picture, HERE, crs="local")[0]["satellite.tif"])
+    told = gdalinfo(tmp_path / "a.tif")
+    assert "Transverse Mercator" in told["coordinateSystem"]["wkt"]
+    (tmp_path / "b.tif").write_bytes(tif(picture, crs="wgs84"))
+    box = crs_bounds(UTM, picture.outline(32))
+    assert box is not None
+    for name in ("a.tif", "b.tif"):
+        extent = np.array(gdalinfo(tmp_path / name)["wgs84Extent"]["coordinates"][0])
+        assert extent.min(axis=0) == pytest.approx(box[:2], abs=1e-5)
+        assert extent.max(axis=0) == pytest.approx(box[2:], abs=1e-5)
+    turned, context = written(picture, Datum(53.2686, -0.5245, heading=30.0), crs="local")
+    back, _ = read(turned)
+    assert back.crs == "local"
+    assert "metres of the local frame" in context.warnings[0].problem
+    with pytest.raises(MissingDatum, match="datum"):
+        written(picture, crs="local")
+    with pytest.raises(Invalid, match="ask for one of them"):
+        written(picture, resampling="nearest")
+
+
+def test_a_resolution_on_request() -> None:
+    back, _ = read({"a.tif": tif(utm((40, 60, 3)), resolution=2.0)})
+    assert back.pixels.shape[:2] == (10, 15)
+    assert back.transform == (2.0, 0.0, 665000.0, 0.0, -2.0, 5905000.0)
+    with pytest.raises(Invalid, match="coarser resolution"):
+        tif(utm(), resolution=1e-6)
+
+
+def test_which_picture() -> None:
+    known = get_format("satellite")
+    keys = [PartKey("imagery", name="a"), PartKey("imagery", name="b")]
+    with pytest.raises(MissingLayer, match="GeoTIFF"):
+        known.choose([], WriteOptions())
+    with pytest.raises(Ambiguous, match="picture=…: a, b"):
+        known.choose(keys, WriteOptions())
+    assert known.choose(keys, WriteOptions(picture="b")) == keys[1:]
+    usual = PartKey("imagery", name="satellite")
+    assert known.choose([*keys, usual], WriteOptions()) == [usual]
+    with pytest.raises(NotFound):
+        known.choose(keys, WriteOptions(picture="c"))
+    assert by_file("satellite.tif") == {"file_type": "tif"}
+    assert by_file("satellite.pgw") == by_file("satellite.png.aux.xml") == {"file_type": "png"}
+    assert by_file("plan.png") == {"file_type": "png", "picture": "plan"}
+    assert by_file("plan.txt") == {}
+
+
+# --- limits -------------------------------------------------------------------------------------------------------
+def test_limits_are_checked_before_anything_is_decoded() -> None:
+    data = tif(utm((100, 100, 4), np.float64))
+    for limits in (Limits(pixels=9_999), Limits(memory_bytes=800_000)):
+        with pytest.raises(TooLarge, match="limit"):
+            read({"a.tif": data}, limits=limits)
+    read({"a.tif": data}, limits=Limits(pixels=10_000, memory_bytes=1_000_000))
+    with pytest.raises(TooLarge, match="limit"):
+        read({"a.png": image((100, 100, 3))}, limits=Limits(pixels=9_999), options={"metres_per_pixel": 1.0})
+
+
+def test_nothing_but_the_given_bytes_is_opened(tmp_path: Path) -> None:
+    """A VRT, and a TIFF whose first bytes lie, are refused whatever they point to."""
+    secret = tmp_path / "secret.tif"
+    secret.write_bytes(tif(utm()))
+    vrt = (
+        f'<VRTDataset rasterXSize="4" rasterYSize="3"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
+        f"<SourceFilename>{secret}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
+    ).encode()
+    for body in (vrt, b"II*\0" + vrt, b"GTIFF_DIR:1:" + str(secret).encode(), str(secret).encode()):
+        with pytest.raises(UnreadableFile):
+            read({"a.tif": body})
+
+
+def bigger(data: bytes, tag: int, value: int) -> bytes:
+    """A little-endian classic TIFF with another value of a tag of its first page."""
+    (at,) = struct.unpack_from("<I", data, 4)
+    (count,) = struct.unpack_from("<H", data, at)
+    for k in range(count):
+        place = at + 2 + 12 * k
+        if struct.unpack_from("<H", data, place)[0] == tag:
+            return data[: place + 2] + struct.pack("<HII", 4, 1, value) + data[place + 12 :]
+    raise AssertionError(f"no tag {tag}")
+
+
+@pytest.mark.parametrize(("width", "height"), [(2**31 - 1, 2**31 - 1), (100_000, 100_000), (0, 3), (2**32 - 1, 1)])
+def test_lying_sizes(width: int, height: int) -> None:
+    data = (SAMPLES / "orchard.tif").read_bytes()
+    lying = bigger(bigger(data, 256, width), 257, height)
+    tracemalloc.start()
+    try:
+        with pytest.raises((UnreadableFile, TooLarge)):
+            read({"a.tif": lying})
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+
+
+def test_resampled_is_the_same_function_for_everybody() -> None:
+    made = written(utm((8, 8, 1)), crs="wgs84")[0]["satellite.tif"]
+    direct = resampled(utm((8, 8, 1)), crs="EPSG:4326")
+    assert np.array_equal(read({"a.tif": made})[0].pixels, direct.pixels)

@@ -1,0 +1,191 @@
+"""Pictures: what screens show of them, and the same place on another grid, against PROJ pixel by pixel."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+from app.errors import Invalid, MissingDatum
+from app.model.frame import Datum
+from app.model.geodesy import local_frame
+from app.model.imagery import Picture, displayed, placed
+from app.model.resampling import resampled, to_wgs84
+
+UTM = "EPSG:32630"
+HERE = Datum(53.2686, -0.5245)
+EAST, NORTH = 665050.0, 5904950.0
+"""A place near the datum in UTM zone 30."""
+
+
+def numbered(shape: tuple[int, int] = (60, 80), crs: str = UTM, transform: Any = None, **properties: Any) -> Picture:
+    """Every pixel another number."""
+    values = np.arange(shape[0] * shape[1], dtype=np.int32).reshape(*shape, 1) + 1
+    return Picture(values, transform or (0.5, 0.0, EAST, 0.0, -0.5, NORTH), crs, properties)
+
+
+def truth(made: Picture, source: Picture, to_source: Any) -> tuple[np.ndarray, np.ndarray]:
+    """For every pixel of the result: the value that stands there by PROJ alone, and how near to a pixel's edge."""
+    height, width = made.pixels.shape[:2]
+    rows, columns = (v.ravel() + 0.5 for v in np.mgrid[0:height, 0:width])
+    places = to_source(placed(made.transform, columns, rows))
+    a, b, c, d, e, f = source.transform
+    back = np.linalg.inv(np.array([[a, b], [d, e]]))
+    u, v = back @ (places - [c, f]).T
+    h, w = source.pixels.shape[:2]
+    inside = (u > 0) & (v > 0) & (u < w) & (v < h)
+    value = np.zeros(len(u), source.pixels.dtype)
+    value[inside] = source.pixels[v[inside].astype(int), u[inside].astype(int), 0]
+    edge = np.minimum(np.abs(u - np.round(u)), np.abs(v - np.round(v)))
+    return value.reshape(height, width), edge.reshape(height, width)
+
+
+@pytest.mark.parametrize("heading", [0.0, 33.0, -120.0])
+@pytest.mark.parametrize("transform", [None, (0.4, 0.3, EAST, 0.3, -0.4, NORTH)], ids=["upright", "turned"])
+def test_every_pixel_stands_where_proj_says(heading: float, transform: Any) -> None:
+    source = numbered(transform=transform, nodata=0)
+    frame = local_frame(Datum(HERE.latitude, HERE.longitude, heading=heading))
+    made = resampled(source, frame, method="nearest")
+    earth = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
+    tmerc = Transformer.from_crs(
+        f"+proj=tmerc +lat_0={HERE.latitude} +lon_0={HERE.longitude} +k=1 +ellps=WGS84", "EPSG:4326", always_xy=True
+    )
+    turn = math.radians(heading)
+
+    def to_source(xy: np.ndarray) -> np.ndarray:
+        # Written out again: local y points to the heading, clockwise from north.
+        east = xy[:, 0] * math.cos(turn) + xy[:, 1] * math.sin(turn)
+        north = xy[:, 1] * math.cos(turn) - xy[:, 0] * math.sin(turn)
+        return np.column_stack(earth.transform(*tmerc.transform(east, north)))
+
+    expected, edge = truth(made, source, to_source)
+    sure = edge > 1e-6
+    assert sure.mean() > 0.99
+    assert np.array_equal(made.pixels[..., 0][sure], expected[sure])
+    assert made.crs == "local"
+    # The corners to the millimetre: the result's outline holds the source's corners, and no more than a pixel beyond.
+    corners = local_frame(frame.datum).to_local(
+        np.column_stack(earth.transform(*source.outline().T, direction="INVERSE"))
+    )
+    a, _, c, _, e, f = made.transform
+    height, width = made.pixels.shape[:2]
+    low, high = np.array([c, f + e * height]), np.array([c + a * width, f])
+    assert (corners.min(axis=0) - low > -1e-3).all()
+    assert (corners.min(axis=0) - low < a + 1e-3).all()
+    assert (high - corners.max(axis=0) > -1e-3).all()
+    assert (high - corners.max(axis=0) < a + 1e-3).all()
+    assert abs(c / a - round(c / a)) < 1e-6
+    assert abs(f / a - round(f / a)) < 1e-6
+
+
+def test_degrees_and_back() -> None:
+    source = numbered(nodata=0)
+    made = to_wgs84(source, method="nearest", resolution=2e-6)
+    forth = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
+    expected, edge = truth(made, source, lambda p: np.column_stack(forth.transform(p[:, 0], p[:, 1])))
+    sure = edge > 1e-6
+    assert np.array_equal(made.pixels[..., 0][sure], expected[sure])
+    assert set(np.unique(made.pixels)) >= set(range(1, 4801)), "at this resolution no pixel is missed"
+
+
+def test_a_plane_stays_a_plane() -> None:
+    """Heights that rise evenly: between pixels they are what the plane says, to a millimetre."""
+    rows, columns = np.mgrid[0:60, 0:80] + 0.5
+    heights = (0.25 * columns - 0.125 * rows)[..., None]
+    source = Picture(heights, (0.5, 0.0, EAST, 0.0, -0.5, NORTH), UTM)
+    frame = local_frame(HERE)
+    made = resampled(source, frame)
+    assert made.properties["nodata"] == "nan"
+    v, u = np.nonzero(np.isfinite(made.pixels[..., 0]))
+    earth = frame.to_wgs84(placed(made.transform, u + 0.5, v + 0.5))
+    there = np.column_stack(Transformer.from_crs("EPSG:4326", UTM, always_xy=True).transform(earth[:, 0], earth[:, 1]))
+    column, row = (there[:, 0] - EAST) / 0.5, (NORTH - there[:, 1]) / 0.5
+    within = (column > 1) & (row > 1) & (column < 79) & (row < 59)
+    expected = 0.25 * column - 0.125 * row
+    assert within.sum() > 4000
+    assert np.abs(made.pixels[v, u, 0] - expected)[within].max() < 1e-3
+
+
+@pytest.mark.parametrize(("kind", "band"), [(np.uint8, "alpha"), (np.uint16, "mask"), (np.int8, "mask")])
+def test_outside_is_said_by_a_further_band(kind: Any, band: str) -> None:
+    source = Picture(np.full((40, 40, 3), 100, kind), (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM)
+    made = resampled(source, local_frame(HERE))
+    assert made.colours == ("red", "green", "blue", band)
+    opaque = made.pixels[..., 3] != 0
+    assert 0.4 < opaque.mean() < 0.6, "half of the box around a turned square"
+    assert (made.pixels[opaque][:, :3] == 100).all(), "transparency does not darken the edge"
+    assert displayed(made)[..., 3].tolist() == np.where(opaque, 255, 0).tolist() or band == "alpha"
+
+
+def test_what_lies_right_is_left_alone() -> None:
+    plan = numbered(crs="local")
+    assert resampled(plan) is plan
+    assert resampled(numbered(), crs=UTM).crs == UTM
+
+
+def test_a_turned_plan_is_set_upright_without_a_datum() -> None:
+    plan = numbered((40, 40), "local", (0.0, 0.5, 0.0, 0.5, 0.0, 0.0), nodata=0)
+    made = resampled(plan, method="nearest")
+    # x runs along the rows, y along the columns: transposed, and upside down since rows run down.
+    assert made.transform == (0.5, 0.0, 0.0, 0.0, -0.5, 20.0)
+    assert np.array_equal(made.pixels[..., 0], plan.pixels[..., 0].T[::-1])
+
+
+def test_palettes_are_never_mixed() -> None:
+    values = (np.arange(1600).reshape(40, 40, 1) % 2 * 200).astype(np.uint8)
+    properties = {"bands": [{"colour": "palette"}], "palette": [[k, 0, 0, 255] for k in range(256)], "nodata": 7}
+    made = resampled(Picture(values, (0.4, 0.3, EAST, 0.3, -0.4, NORTH), UTM, properties), local_frame(HERE))
+    assert set(np.unique(made.pixels)) == {0, 7, 200}
+
+
+def test_what_cannot_be_is_said() -> None:
+    with pytest.raises(MissingDatum, match="datum"):
+        resampled(numbered())
+    with pytest.raises(MissingDatum, match="datum"):
+        to_wgs84(numbered(crs="local"))
+    with pytest.raises(Invalid, match="coarser"):
+        resampled(numbered(), local_frame(HERE), resolution=1e-4)
+    with pytest.raises(Invalid, match="cannot say"):
+        resampled(numbered(), local_frame(Datum(-53.0, 179.0)))
+    with pytest.raises(Invalid, match="no way"):
+        resampled(numbered(crs="EPSG:99999"), local_frame(HERE))
+
+
+# --- displayed ----------------------------------------------------------------------------------------------------
+SQUARE = (1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
+
+
+def shown(values: Any, kind: Any = np.uint8, **properties: Any) -> list[Any]:
+    pixels = np.array(values, kind)
+    return displayed(Picture(pixels, SQUARE, "local", properties)).tolist()
+
+
+def test_bytes_are_shown_as_they_are() -> None:
+    for bands in (1, 2, 3, 4):
+        pixels = np.random.default_rng(bands).integers(0, 255, (700, 900, bands), dtype=np.uint8)
+        assert np.array_equal(displayed(Picture(pixels, SQUARE)), pixels)
+
+
+def test_other_types_are_stretched() -> None:
+    assert shown([[[100], [300]], [[200], [300]]], np.uint16) == [[[0], [255]], [[128], [255]]]
+    assert shown([[[-1.0], [1.0]]], np.float32) == [[[0, 255], [255, 255]]]
+    assert shown([[[5.0], [np.nan]]], np.float64) == [[[0, 255], [0, 0]]]
+    assert shown([[[np.nan], [np.inf]]], np.float64) == [[[0, 0], [0, 0]]]
+    assert shown([[[-1.7e308], [1.7e308]]], np.float64)[0][1][1] == 255
+    assert shown([[[True], [False]]], bool) == [[[255], [0]]]
+
+
+def test_no_data_and_masks_are_transparent() -> None:
+    assert shown([[[7, 7, 7], [7, 7, 8]]], nodata=7) == [[[7, 7, 7, 0], [7, 7, 8, 255]]]
+    bands = [{"colour": "gray"}, {"colour": "mask"}]
+    assert shown([[[9, 1], [8, 0]]], bands=bands) == [[[9, 255], [8, 0]]]
+    assert shown([[[9, 65535], [9, 0]]], np.uint16) == [[[0, 255], [0, 0]]]
+
+
+def test_of_many_bands_the_colours_are_shown() -> None:
+    bands = [{"colour": c} for c in ("undefined", "blue", "green", "red", "undefined")]
+    assert shown([[[1, 2, 3, 4, 5]]], bands=bands) == [[[4, 3, 2]]]
+    assert shown([[[1, 2, 3, 4, 5]]]) == [[[1]]]
