@@ -26,7 +26,7 @@ SUPPLY: Mapping[Layer, str] = {
     "objects": "objects: upload an OSM, KML or GeoJSON file",
     "topology": "a network: upload a tmap2 or OSM file, or a drawing (KML, GeoJSON) with layer=topology",
     "occupancy": "an occupancy grid: upload a map.yaml with its image",
-    "voxels": "a voxel map: upload an OctoMap file",
+    "voxels": "a voxel map: upload an OctoMap file or a point cloud (pcd, ply, las)",
     "imagery": "a georeferenced picture",
     "zones": "zones: upload a drawing with layer=zones",
     "resources": "the files that belong to the objects",

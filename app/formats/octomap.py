@@ -16,7 +16,6 @@ Frame: local; the tree is centred on the origin.
 
 from __future__ import annotations
 
-import math
 import re
 import struct
 from collections.abc import Mapping, Sequence
@@ -31,7 +30,7 @@ from app.formats import Files, Format, Needs, ReadContext, WriteContext, _octoma
 from app.formats._choice import the_one
 from app.model.frame import is_writable
 from app.model.layers import MAP, Layers, PartKey
-from app.model.voxels import DEPTH, UNSET, VoxelMap, coarser, cut, parents_of, pruned
+from app.model.voxels import DEPTH, LOG_ODDS, UNSET, VoxelMap, coarser, cut, parents_of, pruned
 from app.parameters import parameter
 
 NAME = "octomap"
@@ -46,9 +45,6 @@ OCTREE = "OcTree"
 COLOR_OCTREE = "ColorOcTree"
 FULL_TYPES = (OCTREE, COLOR_OCTREE, "OcTreeStamped")
 """Trees whose ``.ot`` is read: OcTreeStamped keeps its times to itself and is stored like an OcTree."""
-
-LOG_ODDS = (np.float32(math.log(0.1192 / (1 - 0.1192))), np.float32(math.log(0.971 / (1 - 0.971))))
-"""What free and occupied become where only they are known: the library's clamping thresholds."""
 
 HEADER_BYTES = 2**16
 WAITING = 7 * DEPTH
@@ -388,7 +384,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named voxel map; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
-    supply = "upload one (an OctoMap file)"
+    supply = "upload one (an OctoMap file or a point cloud)"
     return the_one(keys, "voxels", options.name, options.level, what="voxel map", option="name", supply=supply)
 
 

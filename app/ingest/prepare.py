@@ -22,9 +22,9 @@ from app.model.features import Features, merge_documents
 from app.model.frame import Datum, Level
 from app.model.grid import UNKNOWN, OccupancyGrid
 from app.model.imagery import Picture
-from app.model.layers import Part, PartKey, Resources, join_levels
+from app.model.layers import Part, PartKey, Resources, cloud_name, join_levels
 from app.store import Store
-from app.store.changes import KEEP, Changes, Prepared, Provenance, Put, Replace
+from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Put, Replace
 from app.store.values import Version
 
 Mode = Literal["replace", "merge"]
@@ -71,7 +71,10 @@ def prepare_upload(
     told = bundle.read(files, hints, Known(base.datum, _fence(store, base)), limits)
     renamed: dict[str, dict[str, str]] = {}
     # Sorted, so objects come before the topology that was drawn from them.
-    operations = [_operation(store, base, told, key, mode, files, renamed) for key in sorted(told.parts)]
+    operations: list[Operation] = [
+        _operation(store, base, told, key, mode, files, renamed) for key in sorted(told.parts)
+    ]
+    operations += _stale_clouds(base, told)
     warnings = [*told.warnings, *_idle(hints, told)]
     datum: Any = KEEP
     if told.datum is not None and told.datum != base.datum:
@@ -89,6 +92,13 @@ def prepare_upload(
     notes += [FileNote(name, "zip", True) for name in uploaded.keys() - files.keys()]
     members = {name: files[name] for name in files.keys() - uploaded.keys()}
     return Proposal(prepared, tuple(sorted(notes, key=lambda n: n.name)), tuple(warnings), members)
+
+
+def _stale_clouds(base: Version, told: Bundle) -> list[Drop]:
+    """A voxel map that another file replaces leaves the point cloud behind that it was made of."""
+    held = {entry.key for entry in base.parts}
+    clouds = [PartKey("resources", k.level, cloud_name(k.name)) for k in sorted(told.parts) if k.layer == "voxels"]
+    return [Drop(key) for key in clouds if key in held and key not in told.parts]
 
 
 def _idle(hints: Hints, told: Bundle) -> list[Problem]:

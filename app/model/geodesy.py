@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from pyproj import Proj, Transformer
+from pyproj import CRS, Proj, Transformer
 from pyproj.exceptions import ProjError
 
 from app.errors import Invalid
@@ -156,6 +156,28 @@ def between(source: str, target: str, points: Array) -> Array:
 
 def _short(crs: str) -> str:
     return crs if len(crs) <= 80 else crs[:79] + "…"
+
+
+def crs_to_wgs84(crs: str, points: Array) -> Array:
+    """Points of a CRS (a code or WKT) as (longitude, latitude, height): float64 [n, 3], x first whatever its own order.
+
+    Heights keep their reference and come out in metres, by the unit of the CRS's vertical axis where it has one. What
+    PROJ has no answer for comes out infinite. Raises Invalid for a CRS that PROJ does not know.
+    """
+    out = np.array(points, np.float64)
+    try:
+        out[:, :2] = between(crs, WGS84, points)
+        out[:, 2] *= _vertical_unit(crs)
+    except (ProjError, Invalid) as error:
+        raise Invalid(f"the CRS {_short(crs)} is not known: name one like EPSG:32632") from error
+    return out
+
+
+@lru_cache(maxsize=64)
+def _vertical_unit(crs: str) -> float:
+    """Metres of one unit of height; 1 where the CRS does not say."""
+    axes = CRS.from_user_input(crs).axis_info
+    return next((axis.unit_conversion_factor for axis in axes if axis.direction in ("up", "down")), 1.0)
 
 
 @lru_cache(maxsize=64)

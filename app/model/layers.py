@@ -26,6 +26,13 @@ ZONES = "zones"
 MAP = "map"
 """The usual part names: one network, one site, one set of zones a level, and the grid that robots drive on."""
 
+CLOUD = "points/"
+
+
+def cloud_name(voxels: str) -> str:
+    """The name of the resources that hold the point cloud which a voxel map of this name was made of."""
+    return f"{CLOUD}{voxels}"[:256]
+
 
 @dataclass(frozen=True, slots=True)
 class Resources:

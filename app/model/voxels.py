@@ -27,6 +27,9 @@ HALF = 2 ** (DEPTH - 1)
 UNSET = 255
 """A voxel of the colour (255, 255, 255) has none: OctoMap's convention."""
 
+LOG_ODDS = (np.float32(math.log(0.1192 / (1 - 0.1192))), np.float32(math.log(0.971 / (1 - 0.971))))
+"""What free and occupied become where only they are known: OctoMap's clamping thresholds."""
+
 Box3 = tuple[float, float, float, float, float, float]
 """min x, min y, min z, max x, max y, max z in metres."""
 
@@ -156,6 +159,19 @@ def morton(x: NDArray[np.int64], y: NDArray[np.int64], z: NDArray[np.int64]) -> 
     for k, axis in enumerate((x, y, z)):
         code |= spread((axis + HALF).astype(np.uint64)) << np.uint64(k)
     return code
+
+
+def expanded(voxels: VoxelMap, which: NDArray[np.bool_]) -> tuple[Codes, NDArray[np.intp]]:
+    """All smallest voxels of some leaves: their codes at depth 16, ascending, uint64 [m], and the leaf of each.
+
+    which: bool [n]. The caller bounds m (``voxel_counts``): a leaf at depth 1 has 2^45 of them.
+    """
+    rows = np.flatnonzero(which)
+    size = np.int64(1) << _bits_below(voxels.depth[rows]).astype(np.int64)
+    total = int(size.sum())
+    within = np.arange(total, dtype=np.int64) - np.repeat(np.cumsum(size) - size, size)
+    leaf = np.repeat(rows, size)
+    return voxels.place[leaf] + within.astype(np.uint64), leaf
 
 
 def pruned(voxels: VoxelMap, deepest: int = DEPTH) -> VoxelMap:

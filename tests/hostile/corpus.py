@@ -1187,6 +1187,112 @@ def many_pages(count: int) -> bytes:
     return bytes(first) + b"".join(pages)
 
 
+# --- point clouds ------------------------------------------------------------------------------------------------
+
+
+def pcd(fields: str = "x y z", size: str = "4 4 4", kind: str = "F F F", n: object = 1, data: str = "binary") -> bytes:
+    """A PCD's header."""
+    lines = f"VERSION 0.7\nFIELDS {fields}\nSIZE {size}\nTYPE {kind}\nWIDTH {n}\nHEIGHT 1\nPOINTS {n}\nDATA {data}\n"
+    return lines.encode()
+
+
+def cloud_cases() -> Iterator[Case]:
+    """Headers that promise what is not there, streams that unfold without end, numbers that are none."""
+    point = struct.pack("<3f", 1, 2, 3)
+
+    def case(name: str, data: bytes, verdict: Verdict, end: str = "pcd") -> Case:
+        return Case(f"cloud: {name}", {f"map.{end}": data}, verdict, {"laz": "las"}.get(end, end))
+
+    for n in (-1, "1e9", "9" * 30, 2**31, 2**63, "true", "", "1 1", "\u0661"):
+        yield case(f"pcd, {n} points", pcd(n=n) + point, "refused")
+    yield case("pcd, more points than bytes", pcd(n=10**7) + point, "refused")
+    yield case("pcd, text with fewer rows", pcd(n=10**7, data="ascii") + b"1 2 3\n" * 100, "refused")
+    yield case("pcd, a record of gigabytes", pcd("x y z " + "a " * 5000, "8 " * 5003, "F " * 5003), "refused")
+    yield case("pcd, a count of gigabytes", pcd().replace(b"WIDTH", b"COUNT 1 1 999999999\nWIDTH") + point, "refused")
+    for value in ("nan", "inf", "-inf", "1e999", "1e38"):
+        yield case(f"pcd, a coordinate {value}", pcd(n=2, data="ascii") + f"0 0 0\n{value} 0 0\n".encode(), "any")
+    for value in ("0x10", "1_000", "\u0661", "1,5", "''", "None", "1" * 5000):
+        yield case(
+            f"pcd, a coordinate {value[:8]}", pcd(n=2, data="ascii") + f"0 0 0\n{value} 0 x\n".encode(), "refused"
+        )
+    yield case("pcd, all points without coordinates", pcd(n=3, data="ascii") + b"nan nan nan\n" * 3, "read")
+    yield case(
+        "pcd, at both ends of float64",
+        pcd(size="8 8 8", n=2) + struct.pack("<6d", -1e308, 0, 0, 1e308, 0, 0),
+        "read",
+    )
+    yield case("pcd, a header without end", b"VERSION 0.7\n" + b"# padding\n" * 20000, "refused")
+    yield case("pcd, control characters in a name", pcd("x y z a\0b", "4 4 4 4", "F F F F") + point + bytes(4), "read")
+    ten = "binary_compressed"
+    yield case(
+        "pcd, a stream that refers before its start",
+        pcd(data=ten) + struct.pack("<II", 3, 12) + b"\xe0\xff\xff",
+        "refused",
+    )
+    yield case("pcd, a stream that ends in a reference", pcd(data=ten) + struct.pack("<II", 1, 12) + b"\xff", "refused")
+    bomb = b"\x00\x00" + b"\xe0\xff\x00" * 10**6
+    wide = pcd("x y z w", "4 4 4 1", "F F F U", 1, ten)
+    for count in (264 * 10**6 - 11, 2**32 - 13):
+        head = wide.replace(b"WIDTH", b"COUNT 1 1 1 %d\nWIDTH" % count)
+        yield case(f"pcd, a bomb of {count} bytes", head + struct.pack("<II", len(bomb), count + 12) + bomb, "refused")
+    many = pcd(n=22 * 10**6, data=ten) + struct.pack("<II", len(bomb), 264 * 10**6) + bomb
+    yield case("pcd, a bomb of points", many, "refused")
+    vertex = "element vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    ply = f"ply\nformat binary_little_endian 1.0\n{vertex}"
+    yield case("ply, two vertex elements", f"{ply}{vertex}end_header\n".encode() + 2 * point, "refused", "ply")
+    yield case(
+        "ply, faces that promise gigabytes",
+        f"{ply}element face 9999999999\nproperty list uchar int i\nend_header\n".encode() + point,
+        "refused",
+        "ply",
+    )
+    yield case(
+        "ply, a list longer than the file",
+        f"{ply}element face 1\nproperty list uint int i\nend_header\n".encode() + point + b"\xff" * 4,
+        "refused",
+        "ply",
+    )
+    yield case(
+        "ply, a list of negative length",
+        f"{ply}element face 1\nproperty list int int i\nend_header\n".encode() + point + b"\xff" * 4,
+        "refused",
+        "ply",
+    )
+    yield case(
+        "ply, an element without properties",
+        f"{ply}element nothing 9999999\nend_header\n".encode() + point,
+        "any",
+        "ply",
+    )
+    yield case(
+        "ply, ten thousand properties",
+        (
+            "ply\nformat ascii 1.0\nelement vertex 1\n"
+            + "".join(f"property float p{k}\n" for k in range(3000))
+            + "end_header\n"
+        ).encode(),
+        "refused",
+        "ply",
+    )
+    yield case(
+        "ply, ten thousand elements",
+        f"{ply}{''.join(f'element e{k} 0{chr(10)}' for k in range(3000))}end_header\n".encode() + point,
+        "any",
+        "ply",
+    )
+    for name in ("field.las", "spiral.laz"):
+        data, end = (SAMPLES / "las" / name).read_bytes(), name[-3:]
+        for at, form in ((94, "<H"), (96, "<I"), (100, "<I"), (105, "<H"), (107, "<I")):
+            for value in (0, 1, 2 ** (8 * struct.calcsize(form)) - 1):
+                lie = data[:at] + struct.pack(form, value) + data[at + struct.calcsize(form) :]
+                yield case(f"{name}, {value} at byte {at}", lie, "any", end)
+        for at in range(0, len(data), 37):
+            yield case(f"{name}, cut at {at}", data[:at], "any" if at > 1100 else "refused", end)
+    laz = (SAMPLES / "las" / "spiral.laz").read_bytes()
+    for at in range(375, len(laz) - 4, 29):
+        yield case(f"laz, ones at byte {at}", laz[:at] + b"\xff" * 4 + laz[at + 4 :], "any", "laz")
+
+
 ACCORDING_TO_KIND = (
     yaml_cases,
     xml_cases,
@@ -1198,6 +1304,7 @@ ACCORDING_TO_KIND = (
     archive_cases,
     folder_cases,
     network_cases,
+    cloud_cases,
 )
 
 

@@ -1,0 +1,289 @@
+"""LAS and LAZ files as clouds of points, through laspy and lazrs.
+
+What the header says is held against the file's size before anything is allocated. Coordinates are whole numbers times a
+scale plus an offset, so they come out as float64; a dimension of zeros only says nothing and is left out. Source: ASPRS
+LAS 1.4 R15.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import TooLarge, UnreadableFile
+from app.formats import ReadContext, WriteContext
+from app.formats._points import AXES, RGB, Cloud, check_count, wrong
+
+MAGIC = b"LASF"
+SCALE = 0.001
+"""Metres: the usual step of coordinates, and ours."""
+
+HEADER = struct.Struct("<4s20xBB64x4xHIIBHI")
+"""Signature, version, header size, offset to the points, VLRs, point format, bytes a point, points (until 1.3)."""
+
+VLR_BYTES, EVLR_BYTES = 54, 60
+LASZIP = b"laszip encoded"
+LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Layers of the items of points since 1.4: coordinates and the like, colours, near infrared, waveforms."""
+
+EXTRA_BYTES = 14
+"""An item of as many layers as it has bytes."""
+
+FILES = re.compile(r"EXTENSION|PARAMETERFILE|GRIDS", re.IGNORECASE)
+"""In WKT: words by which PROJ would open a file."""
+
+SOFTWARE = "Fleet Map Server"
+NO_DATE = slice(90, 94)
+"""Day and year of the header: 0 is unknown. A date of today would make other bytes tomorrow."""
+
+WHOLE = {"intensity": 65535, "classification": 255, "user_data": 255, "point_source_id": 65535}
+"""Dimensions of every point that other formats' columns of the same name go to, with their largest value."""
+
+
+def detect(name: str, data: bytes) -> bool:
+    """The signature, and a version that exists."""
+    del name
+    return data.startswith(MAGIC) and len(data) > 26 and data[24] == 1 and data[25] <= 4
+
+
+def parse(data: bytes, context: ReadContext) -> Cloud:
+    """All points. Raises UnreadableFile or TooLarge."""
+    import laspy  # type: ignore[import-untyped]
+
+    count = _check(data, context)
+    with _said_as_ours():
+        las = laspy.read(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs)
+    if len(las.points) != count:
+        raise wrong(f"the header says {count} points, the file has {len(las.points)}", where="header")
+    return _cloud(las, count, context)
+
+
+def _check(data: bytes, context: ReadContext) -> int:
+    """The number of points, after the header is held against limits and the file's size."""
+    if len(data) < 227:
+        raise wrong("the file ends within the header", where="header")
+    magic, major, minor, size, start, vlrs, form, record, count = HEADER.unpack_from(data)
+    if magic != MAGIC or major != 1 or minor > 4:
+        raise wrong(f"only LAS 1.0 to 1.4 can be read, this is {magic!r} {major}.{minor}", where="header")
+    need = {3: 235, 4: 375}.get(minor, 227)
+    if size < need or start < size or start > len(data):
+        raise wrong("the sizes in the header contradict each other", where="header")
+    if vlrs * VLR_BYTES > start - size:
+        raise wrong(f"{vlrs} records do not go before the points", where="header")
+    evlrs = 0
+    if minor == 4:
+        first, evlrs, count = struct.unpack_from("<QIQ", data, 235)
+        if evlrs and (first > len(data) or evlrs * EVLR_BYTES > len(data) - first):
+            raise wrong(f"{evlrs} records do not go after the points", where="header")
+    if any(not math.isfinite(v) for v in struct.unpack_from("<6d", data, 131)):
+        raise wrong("scales and offsets must be finite numbers", where="header")
+    if form & 0x3F > 10:
+        raise wrong(f"there is no point format {form & 0x3F}", where="header")
+    check_count(count, context)
+    if count * record > context.limits.unpacked_bytes:
+        raise TooLarge(f"the points take {count * record} bytes; the limit is {context.limits.unpacked_bytes}")
+    if form & 0xC0 == 0:
+        if start + count * record > len(data):
+            have = len(data) - start
+            raise wrong(f"{count} points of {record} bytes take {count * record} bytes, the file has {have}")
+    elif count:
+        _check_chunks(data, start, size, vlrs, count, record)
+    return int(count)
+
+
+def _check_chunks(data: bytes, start: int, size: int, vlrs: int, count: int, record: int) -> None:
+    """Of compressed points: the record that tells their items, and the table of chunks, allocated as it says."""
+    position = size
+    for _ in range(vlrs):
+        user, number, length = struct.unpack_from("<2x16sHH", data, position)
+        position += VLR_BYTES
+        if user.rstrip(b"\0") == LASZIP and number == 22204:
+            break
+        position += length
+    else:
+        raise wrong("the file is compressed and has no LASzip record", where="header")
+    if length < 34 or position + length > start:
+        raise wrong("the LASzip record ends too early", where="laszip")
+    items = struct.unpack_from("<H", data, position + 32)[0]
+    if length < 34 + 6 * items:
+        raise wrong("the LASzip record ends too early", where="laszip")
+    kinds = [struct.unpack_from("<HH", data, position + 34 + 6 * k) for k in range(items)]
+    total = sum(bytes_ for _, bytes_ in kinds)
+    if total != record:
+        raise wrong(f"the LASzip record tells points of {total} bytes, the header of {record}", where="laszip")
+    if len(data) - start < 8:
+        raise wrong("the compressed points are missing", where="laszip")
+    (table,) = struct.unpack_from("<q", data, start)
+    if table == -1:  # a writer that could not go back has put the offset at the very end
+        (table,) = struct.unpack_from("<q", data, len(data) - 8)
+    if not start + 8 <= table <= len(data) - 8:
+        raise wrong("the table of chunks lies outside of the file", where="laszip")
+    if struct.unpack_from("<I", data, table + 4)[0] > count:
+        raise wrong("there are more chunks than points", where="laszip")
+    if any(kind in LAYERS or kind == EXTRA_BYTES for kind, _ in kinds):
+        _check_layers(data, start, table, data[position : position + length], kinds)
+
+
+def _check_layers(data: bytes, start: int, table: int, laszip: bytes, kinds: list[tuple[int, int]]) -> None:
+    """Of the point formats of 1.4: each chunk tells the sizes of its layers, which are allocated as it says."""
+    import lazrs  # type: ignore[import-untyped]
+
+    stream = io.BytesIO(data)
+    stream.seek(start)
+    with _said_as_ours():
+        chunks = lazrs.read_chunk_table(stream, lazrs.LazVlr(laszip))
+    layers = sum(bytes_ if kind == EXTRA_BYTES else LAYERS.get(kind, 0) for kind, bytes_ in kinds)
+    first = sum(bytes_ for _, bytes_ in kinds) + 4
+    position = start + 8
+    for _, size in chunks:
+        if size < first + 4 * layers or position + size > table:
+            raise wrong("a chunk ends beyond the points, or before it begins", where="laszip")
+        if first + 4 * layers + sum(struct.unpack_from(f"<{layers}I", data, position + first)) > size:
+            raise wrong("the layers of a chunk are larger than the chunk", where="laszip")
+        position += size
+
+
+@contextmanager
+def _said_as_ours() -> Iterator[None]:
+    """Errors of laspy and lazrs as UnreadableFile. lazrs panics on some damage: an exception of Rust, and no other."""
+    import laspy
+    import lazrs
+
+    try:
+        yield
+    except (laspy.errors.LaspyException, lazrs.LazrsError, AssertionError) as error:
+        raise wrong(f"{str(error)[:200] or type(error).__name__}") from error
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":
+            raise
+        raise UnreadableFile("the compressed points are damaged", wrong("damaged points").problems) from error
+
+
+def _cloud(las: Any, count: int, context: ReadContext) -> Cloud:
+    columns: dict[str, NDArray[Any]] = {}
+    for axis, scale, offset in zip(AXES, las.header.scales, las.header.offsets, strict=True):
+        columns[axis] = las.points.array[axis.upper()] * float(scale) + float(offset)
+    for name in las.point_format.dimension_names:
+        if name in ("X", "Y", "Z"):
+            continue
+        column = np.asarray(las[name])
+        if len(column) and column.any():
+            columns[name if name not in columns else f"{name}_"] = column
+    crs = _crs(las.header)
+    if crs is not None and (len(crs) > 2**16 or FILES.search(crs)):
+        context.warn("the coordinate reference system is too long or names files of its own: left out, say crs=EPSG:…")
+        crs = None
+    return Cloud(columns, count, crs=crs)
+
+
+def _crs(header: Any) -> str | None:
+    """The coordinate reference system: WKT, else the code that GeoTIFF keys name; None where there is none."""
+    records = [*header.vlrs, *(header.evlrs or ())]
+    for record in records:
+        if record.user_id == "LASF_Projection" and record.record_id == 2112:
+            text = str(getattr(record, "string", "")).strip("\0 ")
+            if re.match(r"[A-Z_0-9]{4,40}\[", text):  # and nothing else that PROJ takes for a CRS
+                return text
+    for record in records:
+        if record.user_id == "LASF_Projection" and record.record_id == 34735:
+            keys = {k.id: k.value_offset for k in getattr(record, "geo_keys", ()) if k.tiff_tag_location == 0}
+            code = keys.get(3072) or keys.get(2048)  # projected, geographic
+            if code and 1024 <= code < 32767:
+                return f"EPSG:{code}"
+    return None
+
+
+# --- writing ------------------------------------------------------------------------------------------------------
+def again(data: bytes, compress: bool) -> bytes:
+    """An uploaded file, compressed or not, with all that it holds."""
+    import laspy
+
+    with _said_as_ours():
+        las = laspy.read(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs)
+        out = io.BytesIO()
+        las.write(out, do_compress=compress, laz_backend=laspy.LazBackend.Lazrs)
+    written = bytearray(out.getvalue())
+    written[NO_DATE] = data[NO_DATE]
+    return bytes(written)
+
+
+def pack(columns: Mapping[str, NDArray[Any]], context: WriteContext, compress: bool) -> bytes:
+    """LAS 1.4, point format 7 with colours and 6 without, in steps of a millimetre; what LAS has no dimension for
+    becomes extra bytes. columns: as ``plain`` gives them. Points without finite coordinates are left out."""
+    import laspy
+
+    places = np.stack([columns[axis].astype(np.float64) for axis in AXES], axis=1)
+    good = np.isfinite(places).all(axis=1)
+    context.drop("points", int(np.count_nonzero(~good)), "LAS has no points without finite coordinates")
+    places = places[good]
+    coloured = all(name in columns for name in RGB)
+    header = laspy.LasHeader(version="1.4", point_format=7 if coloured else 6)
+    header.generating_software = SOFTWARE
+    header.global_encoding.wkt = True
+    low = places.min(axis=0) if len(places) else np.zeros(3)
+    high = places.max(axis=0) if len(places) else np.zeros(3)
+    header.offsets = np.floor((low + high) / 2)
+    reach = float(np.maximum(high - header.offsets, header.offsets - low).max())
+    scale = SCALE
+    while reach / scale >= 2**31 - 1:
+        scale *= 10
+    header.scales = np.full(3, scale)
+    if scale > SCALE:
+        context.warn(f"the cloud is so large that its points are written in steps of {scale:g} m")
+    extra: dict[str, NDArray[Any]] = {}
+    whole: dict[str, NDArray[Any]] = {}
+    for name, column in columns.items():
+        if name in AXES or (coloured and name in RGB):
+            continue
+        chosen = column[good]
+        if name == "gps_time" or (name in WHOLE and _within(chosen, WHOLE[name])):
+            whole[name] = chosen
+        else:
+            taken = {d.lower() for d in header.point_format.dimension_names} | {n.lower() for n in extra}
+            extra[_free(name, taken)] = chosen
+    if extra:
+        header.add_extra_dims(
+            [laspy.ExtraBytesParams(name=n, type=c.dtype.newbyteorder("<")) for n, c in extra.items()]
+        )
+    las = laspy.LasData(header)
+    las.points = laspy.ScaleAwarePointRecord.zeros(len(places), header=header)
+    for k, axis in enumerate(AXES):
+        las[axis.upper()] = np.round((places[:, k] - header.offsets[k]) / scale).astype(np.int32)
+    for name, column in {**whole, **extra}.items():
+        las[name] = column
+    las.return_number = np.ones(len(places), np.uint8)
+    las.number_of_returns = np.ones(len(places), np.uint8)
+    for name in RGB if coloured else ():
+        las[name] = columns[name][good].astype(np.uint16) * np.uint16(257)
+    las.update_header()
+    out = io.BytesIO()
+    las.write(out, do_compress=compress, laz_backend=laspy.LazBackend.Lazrs)
+    written = bytearray(out.getvalue())
+    written[NO_DATE] = bytes(4)
+    return bytes(written)
+
+
+def _within(column: NDArray[Any], most: int) -> bool:
+    """Whether all values are whole numbers from 0 to this."""
+    if not len(column):
+        return True
+    if column.dtype.kind == "f" and not bool((np.isfinite(column) & (column == np.floor(column))).all()):
+        return False
+    return int(column.min()) >= 0 and int(column.max()) <= most
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """A name for extra bytes: at most 32 bytes of ASCII, and not a dimension's that is there."""
+    stem = re.sub(r"[^ -~]", "_", name)[:28] or "value"
+    out, k = stem, 2
+    while out.lower() in taken:
+        out, k = f"{stem}_{k}", k + 1
+    return out

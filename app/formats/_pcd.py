@@ -1,0 +1,299 @@
+"""PCD files as clouds of points: the text header, and ``ascii``, ``binary`` or ``binary_compressed`` data.
+
+Header lines ``VERSION``, ``FIELDS`` (``COLUMNS`` before 0.6), ``SIZE``, ``TYPE`` (I, U, F), ``COUNT``, ``WIDTH``,
+``HEIGHT``, ``VIEWPOINT``, ``POINTS``, ``DATA``. Numbers are little endian. A field ``_`` is padding. Compressed data:
+uint32 compressed and unfolded size, then LZF of all values of the first field, then of the second …; PCL leaves padding
+out there, others do not. Source: PCL's pcd_io.cpp and the format's documentation.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import TooLarge
+from app.formats import ReadContext
+from app.formats._lzf import expand, squeeze
+from app.formats._points import RGB, UNTURNED, Cloud, check_columns, check_count, table, wrong
+
+Data = Literal["ascii", "binary", "binary_compressed"]
+KINDS: tuple[Data, ...] = get_args(Data)
+WORDS = ("VERSION", "FIELDS", "COLUMNS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
+HEADER_BYTES = 2**16
+RECORD_BYTES = 2**16
+PADDING = "_"
+START = re.compile(rb"(?:\xef\xbb\xbf)?(?:[ \t]*(?:#[^\n]*)?\r?\n)*[ \t]*(?:VERSION|FIELDS|COLUMNS)[ \t]")
+
+_TYPES = {f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)}
+_TYPES |= {"F4": "<f4", "F8": "<f8"}
+
+
+def detect(name: str, data: bytes) -> bool:
+    """A header that starts with a version or fields, after comments, and tells what data follows."""
+    del name
+    head = data[:HEADER_BYTES]
+    return START.match(head) is not None and re.search(rb"^[ \t]*DATA[ \t]", head, re.MULTILINE) is not None
+
+
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """A field of the header. position: of its column among those of text rows."""
+
+    name: str
+    dtype: np.dtype[Any]
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    fields: tuple[_Field, ...]
+    width: int
+    height: int
+    viewpoint: tuple[float, ...]
+    comments: tuple[str, ...]
+    data: Data
+    body: int
+    lines: int
+
+
+def parse(data: bytes, context: ReadContext) -> Cloud:
+    """All points. Raises UnreadableFile (line and word of the header, or the reason) or TooLarge."""
+    header = _header(data, context)
+    count = header.width * header.height
+    check_count(count, context)
+    record = sum(f.dtype.itemsize * f.count for f in header.fields)
+    if record > RECORD_BYTES:
+        raise wrong(f"a point takes {record} bytes; at most {RECORD_BYTES} can be read", where="SIZE")
+    if header.data == "ascii":
+        columns = _from_text(data, header, count, context)
+    elif header.data == "binary":
+        columns = _from_binary(data, header, count, record, context)
+    else:
+        columns = _from_compressed(data, header, count, context)
+    check_columns(columns)
+    return Cloud(columns, header.width, header.height, header.viewpoint, header.comments)
+
+
+def _header(data: bytes, context: ReadContext) -> _Header:
+    said: dict[str, tuple[list[str], int]] = {}
+    comments: list[str] = []
+    position, number = 3 if data.startswith(b"\xef\xbb\xbf") else 0, 0
+    while "DATA" not in said:
+        end = data.find(b"\n", position, HEADER_BYTES)
+        if end < 0:
+            raise wrong("the header does not end: the line DATA is missing", number + 1, "DATA")
+        number += 1
+        line, position = data[position:end].decode("utf-8", "replace").strip(), end + 1
+        if line.startswith("#"):
+            comments.append(line)
+            continue
+        word, *values = line.split() or [""]
+        if word in WORDS:
+            said[word] = (values, number)
+        elif word:
+            context.warn(f"unknown word {word[:40]!r} in the header: left out", line=number, where=word[:40])
+    for word in ("SIZE", "TYPE", "WIDTH"):
+        if word not in said:
+            raise wrong(f"the header does not tell {word}", where=word)
+    fields = _fields(said)
+    width = _whole(said, "WIDTH")
+    height = _whole(said, "HEIGHT") if "HEIGHT" in said else 1
+    if "POINTS" in said and _whole(said, "POINTS") != width * height:
+        reason = f"POINTS is {_whole(said, 'POINTS')}, but WIDTH times HEIGHT is {width * height}"
+        raise wrong(reason, said["POINTS"][1], "POINTS")
+    (kind, *_), line_number = said["DATA"][0] or [""], said["DATA"][1]
+    known = next((k for k in KINDS if k == kind), None)
+    if known is None:
+        raise wrong(f"DATA must be one of {', '.join(KINDS)}, got {kind[:40]!r}", line_number, "DATA")
+    usual = [c for c in comments if not c.startswith("# .PCD")]
+    return _Header(fields, width, height, _viewpoint(said), tuple(usual), known, position, number)
+
+
+def _fields(said: Mapping[str, tuple[list[str], int]]) -> tuple[_Field, ...]:
+    word = "FIELDS" if "FIELDS" in said else "COLUMNS"
+    if word not in said:
+        raise wrong("the header does not tell FIELDS", where="FIELDS")
+    names, line = said[word]
+    counts, count_line = said.get("COUNT", (["1"] * len(names), line))
+    (sizes, size_line), (types, type_line) = said["SIZE"], said["TYPE"]
+    for what, values, at in (("SIZE", sizes, size_line), ("TYPE", types, type_line), ("COUNT", counts, count_line)):
+        if len(values) != len(names):
+            raise wrong(f"{what} has {len(values)} values for {len(names)} fields", at, what)
+    out = []
+    seen: set[str] = set()
+    for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
+        dtype = _TYPES.get(f"{kind}{size}")
+        if dtype is None:
+            raise wrong(f"field {name[:40]}: there is no type {kind[:8]} of {size[:8]} bytes", type_line, "TYPE")
+        if not re.fullmatch(r"[1-9][0-9]{0,4}", count):
+            raise wrong(
+                f"field {name[:40]}: COUNT must be a number from 1 to 99999, got {count[:8]!r}", count_line, "COUNT"
+            )
+        if name != PADDING and name in seen:
+            raise wrong(f"two fields are called {name[:40]!r}", line, word)
+        seen.add(name)
+        out.append(_Field(name, np.dtype(dtype), int(count)))
+    return tuple(out)
+
+
+def _whole(said: Mapping[str, tuple[list[str], int]], word: str) -> int:
+    values, line = said[word]
+    if len(values) != 1 or not re.fullmatch(r"[0-9]{1,12}", values[0]):
+        raise wrong(f"{word} must be a whole number, got {' '.join(values)[:40]!r}", line, word)
+    return int(values[0])
+
+
+def _viewpoint(said: Mapping[str, tuple[list[str], int]]) -> tuple[float, ...]:
+    if "VIEWPOINT" not in said:
+        return UNTURNED
+    values, line = said["VIEWPOINT"]
+    pattern = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?"
+    if len(values) != 7 or not all(re.fullmatch(pattern, v, re.ASCII) for v in values):
+        raise wrong(f"VIEWPOINT must be seven numbers, got {' '.join(values)[:80]!r}", line, "VIEWPOINT")
+    numbers = tuple(float(v) + 0.0 for v in values)
+    if not all(map(math.isfinite, numbers)):
+        raise wrong("VIEWPOINT must be seven finite numbers", line, "VIEWPOINT")
+    return numbers
+
+
+def _dtype(fields: tuple[_Field, ...]) -> np.dtype[Any]:
+    return np.dtype([(f"{k}", f.dtype, (f.count,)) if f.count > 1 else (f"{k}", f.dtype) for k, f in enumerate(fields)])
+
+
+def _columns(rows: NDArray[Any], fields: tuple[_Field, ...]) -> dict[str, NDArray[Any]]:
+    return {f.name: rows[f"{k}"] for k, f in enumerate(fields) if f.name != PADDING}
+
+
+def _from_text(data: bytes, header: _Header, count: int, context: ReadContext) -> dict[str, NDArray[Any]]:
+    if len(data) - header.body > context.limits.text_bytes:
+        raise TooLarge(
+            f"the points take {len(data) - header.body} bytes of text; the limit is {context.limits.text_bytes}"
+        )
+    flat = np.dtype([(f"{k}.{j}", f.dtype) for k, f in enumerate(header.fields) for j in range(f.count)])
+    rows = table(data[header.body :], flat, count, header.lines + 1)
+    if len(rows) > count:
+        context.warn(f"the header says {count} points and more rows follow: left out", where="POINTS")
+    return _columns(np.ascontiguousarray(rows[:count]).view(_dtype(header.fields)), header.fields)
+
+
+def _from_binary(
+    data: bytes, header: _Header, count: int, record: int, context: ReadContext
+) -> dict[str, NDArray[Any]]:
+    rest = len(data) - header.body
+    if rest < count * record:
+        raise wrong(f"{count} points of {record} bytes take {count * record} bytes, the file has {rest}", where="DATA")
+    if rest > count * record:
+        context.warn(f"{rest - count * record} bytes follow after the last point", where="DATA")
+    return _columns(np.frombuffer(data, _dtype(header.fields), count, header.body), header.fields)
+
+
+def _from_compressed(data: bytes, header: _Header, count: int, context: ReadContext) -> dict[str, NDArray[Any]]:
+    if not count and len(data) - header.body < 8:
+        return {f.name: np.empty(0, f.dtype) for f in header.fields if f.name != PADDING}
+    if len(data) - header.body < 8:
+        raise wrong("the sizes of the compressed data are missing", where="DATA")
+    packed, size = struct.unpack_from("<II", data, header.body)
+    real = tuple(f for f in header.fields if f.name != PADDING)
+    fields = next(
+        (chosen for chosen in (real, header.fields) if size == count * sum(f.dtype.itemsize * f.count for f in chosen)),
+        None,
+    )
+    if fields is None:
+        raise wrong(f"{count} points do not take the {size} bytes that the compressed data says", where="DATA")
+    if size > context.limits.unpacked_bytes:
+        raise TooLarge(f"the points take {size} bytes; the limit is {context.limits.unpacked_bytes}")
+    start = header.body + 8
+    if len(data) - start < packed:
+        raise wrong(f"the compressed data has {len(data) - start} bytes, the file says {packed}", where="DATA")
+    try:
+        flat = expand(data[start : start + packed], size)
+    except ValueError as error:
+        raise wrong(str(error), where="DATA") from error
+    out: dict[str, NDArray[Any]] = {}
+    offset = 0
+    for f in fields:
+        values = np.frombuffer(flat, f.dtype, count * f.count, offset)
+        offset += values.nbytes
+        if f.name != PADDING:
+            out[f.name] = values if f.count == 1 else values.reshape(count, f.count)
+    return out
+
+
+# --- writing ------------------------------------------------------------------------------------------------------
+def pack(cloud: Cloud, kind: Data) -> bytes:
+    """A PCD of version 0.7."""
+    columns = {name: np.ascontiguousarray(c, c.dtype.newbyteorder("<")) for name, c in cloud.columns.items()}
+    if kind == "ascii":  # packed colours with an alpha of 255 are no number as floats; PCL writes them so, too
+        columns |= {
+            name: c.view("<u4") for name, c in columns.items() if name in ("rgb", "rgba") and c.dtype == np.float32
+        }
+    n = len(cloud)
+    counts = [1 if c.ndim == 1 else c.shape[1] for c in columns.values()]
+    header = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        *cloud.comments,
+        "VERSION 0.7",
+        f"FIELDS {' '.join(columns)}",
+        f"SIZE {' '.join(str(c.dtype.itemsize) for c in columns.values())}",
+        f"TYPE {' '.join(c.dtype.kind.upper() for c in columns.values())}",
+        f"COUNT {' '.join(map(str, counts))}",
+        f"WIDTH {cloud.width}",
+        f"HEIGHT {cloud.height}",
+        f"VIEWPOINT {' '.join(f'{v:.17g}' for v in cloud.viewpoint)}",
+        f"POINTS {n}",
+        f"DATA {kind}",
+    ]
+    return ("\n".join(header) + "\n").encode() + _body(columns, n, kind)
+
+
+def _body(columns: Mapping[str, NDArray[Any]], n: int, kind: Data) -> bytes:
+    if kind == "binary_compressed":
+        flat = b"".join(c.tobytes() for c in columns.values())
+        packed = squeeze(flat)
+        return struct.pack("<II", len(packed), len(flat)) + packed
+    if kind == "binary":
+        dtype = np.dtype([(name, c.dtype, c.shape[1:]) for name, c in columns.items()])
+        rows = np.empty(n, dtype)
+        for name, column in columns.items():
+            rows[name] = column
+        return rows.tobytes()
+    return text_rows([c if c.ndim == 1 else c[:, k] for c in columns.values() for k in range(c.size // max(n, 1))], n)
+
+
+def text_rows(columns: list[NDArray[Any]], n: int) -> bytes:
+    """Rows of the shortest texts that read back as the same values, a few thousand at a time."""
+    out = []
+    for start in range(0, n, 2**14):
+        texts = [
+            c[start : start + 2**14].astype("U") if c.dtype.kind == "f" else map(str, c[start : start + 2**14].tolist())
+            for c in columns
+        ]
+        out.append("".join(" ".join(row) + "\n" for row in zip(*texts, strict=True)))
+    return "".join(out).encode()
+
+
+def for_pcl(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Columns under common names as PCL calls them: normals ``normal_x`` …, colours packed into one ``rgb``."""
+    out: dict[str, NDArray[Any]] = {}
+    names = {"nx": "normal_x", "ny": "normal_y", "nz": "normal_z"}
+    coloured = all(name in columns for name in RGB)
+    for name, column in columns.items():
+        if coloured and name in RGB:
+            if name == RGB[0]:
+                red, green, blue = (columns[c].astype(np.uint32) for c in RGB)
+                packed = red << np.uint32(16) | green << np.uint32(8) | blue
+                if "alpha" in columns:
+                    out["rgba"] = packed | columns["alpha"].astype(np.uint32) << np.uint32(24)
+                else:
+                    out["rgb"] = packed.astype("<u4").view("<f4")
+        elif not (name == "alpha" and coloured):
+            said = names.get(name, re.sub(r"[^!-~]", "_", name))
+            out[said if said not in out and said != PADDING else f"{said}_{len(out)}"] = column
+    return out

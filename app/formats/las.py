@@ -1,0 +1,91 @@
+"""LAS and LAZ point clouds ↔ voxels.
+
+Read: the voxels that the points lie in, and the file beside them (see ``_points``); the file's CRS places them.
+Written: the very file that the voxels were made of; the points of another cloud format's; else the centres of the
+occupied voxels. What is written anew is LAS 1.4 in steps of a millimetre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _las, _points, register
+from app.formats._clouds import PARSERS
+from app.model.layers import MAP, Layers, PartKey
+from app.parameters import parameter
+
+NAME = "las"
+ENDINGS = ("las", "laz")
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """Which cloud, and how it is written."""
+
+    name: str | None = parameter(None, _points.NAME_DOC)
+    level: str | None = parameter(None, _points.LEVEL_DOC)
+    kind: Literal["las", "laz"] | None = parameter(None, "laz is compressed; default: as uploaded, else las")
+    frame: Literal["source", "local"] | None = parameter(None, _points.FRAME_DOC)
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """One voxel map and its cloud. Raises UnreadableFile or TooLarge."""
+    main = context.main or next(iter(files))
+    compressed = len(files[main]) > 104 and bool(files[main][104] & 0xC0)
+    return _points.read(files, context, "laz" if compressed else "las", _las.parse)
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``map.las`` or ``map.laz`` (``<name>.las`` where a name is asked for).
+
+    Raises MissingLayer, NotFound, Ambiguous or Invalid.
+    """
+    options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
+    wanted = _points.source(layers, context, options.name, options.level, options.frame, ENDINGS, PARSERS)
+    kind = options.kind or (wanted.form if wanted.form in ENDINGS else "las")
+    name = _points.file_name(options.name, kind)
+    if wanted.data is not None:
+        return {name: wanted.data if kind == wanted.form else _las.again(wanted.data, kind == "laz")}
+    cloud = wanted.cloud()
+    if wanted.form not in ENDINGS:
+        if cloud.height > 1:
+            context.drop("rows and columns of the cloud", 1, "LAS points are one list: ask for pcd")
+        context.drop("viewpoint", int(cloud.viewpoint != _points.UNTURNED), "LAS has no place for it: ask for pcd")
+        for what, count in cloud.further.items():
+            context.drop(what, count, "LAS has points only")
+    return {name: _las.pack(_points.plain(cloud), context, kind == "laz")}
+
+
+def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
+    """The named voxel map; else ``map``, else the only one; and the cloud that belongs to it."""
+    return _points.choose(keys, options.name, options.level)
+
+
+def by_file(name: str) -> dict[str, str]:
+    """``map.laz`` asks for compression; ``lab.las`` for the voxel map ``lab``, too."""
+    stem, _, end = name.rpartition(".")
+    if not stem or end not in ENDINGS:
+        return {}
+    return {"kind": end, **({} if stem == MAP else {"name": stem})}
+
+
+register(
+    Format(
+        name=NAME,
+        title="LAS and LAZ point cloud",
+        files=("map.las", "map.laz"),
+        media_types=("application/vnd.las", "application/vnd.laszip"),
+        carries=frozenset({"voxels", "resources"}),
+        detect=_las.detect,
+        read=read,
+        write=write,
+        needs=Needs((frozenset({"voxels"}),), also=frozenset({"resources"})),
+        read_options=_points.ReadOptions,
+        write_options=WriteOptions,
+        extensions=(".las", ".laz"),
+        choose=choose,
+        by_file=by_file,
+    )
+)

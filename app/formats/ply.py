@@ -1,0 +1,78 @@
+"""PLY point clouds (and meshes, of which the vertices count) ↔ voxels.
+
+Read: the voxels that the vertices lie in, and the file beside them (see ``_points``). Written: the very file that the
+voxels were made of; the points of another cloud format's; else the centres of the occupied voxels, as float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _ply, _points, register
+from app.formats._clouds import PARSERS
+from app.model.layers import Layers, PartKey
+from app.parameters import parameter
+
+NAME = "ply"
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """Which cloud, and how it is written."""
+
+    name: str | None = parameter(None, _points.NAME_DOC)
+    level: str | None = parameter(None, _points.LEVEL_DOC)
+    data: Literal["ascii", "binary_little_endian", "binary_big_endian"] | None = parameter(
+        None, "how points are encoded; default: as uploaded, else binary_little_endian"
+    )
+    frame: Literal["source", "local"] | None = parameter(None, _points.FRAME_DOC)
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """One voxel map and its cloud. Raises UnreadableFile (with line and word, or the reason) or TooLarge."""
+    return _points.read(files, context, NAME, _ply.parse)
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``map.ply`` (``<name>.ply`` where a name is asked for). Raises MissingLayer, NotFound, Ambiguous or Invalid."""
+    options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
+    wanted = _points.source(layers, context, options.name, options.level, options.frame, (NAME,), PARSERS)
+    name = _points.file_name(options.name, NAME)
+    if wanted.data is not None and options.data is None:
+        return {name: wanted.data}
+    cloud = wanted.cloud()
+    if wanted.form != NAME:
+        if cloud.height > 1:
+            context.drop("rows and columns of the cloud", 1, "a PLY's vertices are one list: ask for pcd")
+        context.drop("viewpoint", int(cloud.viewpoint != _points.UNTURNED), "PLY has no place for it: ask for pcd")
+        cloud = replace(cloud, columns=_points.plain(cloud), comments=())
+    for what, count in cloud.further.items():
+        context.drop(what, count, "written again, a PLY has vertices only: leave out data= and frame= to keep it")
+    return {name: _ply.pack(cloud, options.data or "binary_little_endian")}
+
+
+def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
+    """The named voxel map; else ``map``, else the only one; and the cloud that belongs to it."""
+    return _points.choose(keys, options.name, options.level)
+
+
+register(
+    Format(
+        name=NAME,
+        title="PLY point cloud",
+        files=("map.ply",),
+        media_types=("application/octet-stream",),
+        carries=frozenset({"voxels", "resources"}),
+        detect=_ply.detect,
+        read=read,
+        write=write,
+        needs=Needs((frozenset({"voxels"}),), also=frozenset({"resources"})),
+        read_options=_points.ReadOptions,
+        write_options=WriteOptions,
+        extensions=(".ply",),
+        choose=choose,
+        by_file=_points.by_file((NAME,)),
+    )
+)

@@ -1,0 +1,244 @@
+"""las, laz: facts worked out by hand, laspy reads what is written, CRS and datum, lies in headers are found before
+anything is allocated."""
+
+from __future__ import annotations
+
+import io
+import random
+import struct
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pytest
+from pyproj import CRS, Transformer
+
+from app import formats
+from app.bundle import Hints, Known
+from app.bundle import read as read_bundle
+from app.convert import offline
+from app.errors import BadUpload, TooLarge, UnreadableFile
+from app.formats import Group, Limits, ReadContext, get_format
+from app.model.frame import Datum
+from app.model.geodesy import local_frame
+from app.model.layers import Layers, PartKey
+from app.model.voxels import VoxelMap
+from tests.formats import clouds
+
+FORMAT = get_format("las")
+SAMPLES = Path(__file__).resolve().parents[1] / "samples"
+FIELD = (SAMPLES / "las" / "field.las").read_bytes()
+SPIRAL = (SAMPLES / "las" / "spiral.laz").read_bytes()
+POINTS = struct.unpack_from("<I", SPIRAL, 96)[0]
+"""Where they start: with the offset of the table of chunks."""
+
+
+def read(data: bytes, options: dict[str, str] | None = None, **more: Any) -> tuple[VoxelMap, ReadContext, Layers]:
+    context = ReadContext(options=formats.read_options(FORMAT, options or {}), **more)
+    layers = formats.read(Group(FORMAT, "map.las", {"map.las": data}), context)
+    voxels = layers.parts[PartKey("voxels")]
+    assert isinstance(voxels, VoxelMap)
+    return voxels, context, layers
+
+
+def written(files: dict[str, bytes], to: str = "las", **options: str) -> bytes:
+    (out,) = offline(files, to, options=options).files.values()
+    return out
+
+
+def points(data: bytes) -> Any:
+    return laspy.read(io.BytesIO(data))
+
+
+def test_places_by_the_files_own_crs() -> None:
+    """UTM 30N, near Sheffield: the datum is the south-west corner, and PROJ's own transverse Mercator the truth."""
+    voxels, context, layers = read(FIELD, {"resolution": "0.01"})
+    earth = Transformer.from_crs("EPSG:32630", "EPSG:4326", always_xy=True)
+    lon, lat = earth.transform([700000, 700010, 700010], [5900000, 5900000, 5900020])
+    assert layers.datum is not None
+    assert (layers.datum.latitude, layers.datum.longitude) == (
+        np.floor(min(lat) * 1e7) / 1e7,
+        np.floor(min(lon) * 1e7) / 1e7,
+    )
+    pipe = f"+proj=tmerc +lat_0={layers.datum.latitude} +lon_0={layers.datum.longitude} +k=1 +ellps=WGS84"
+    x, y = Transformer.from_crs("EPSG:4326", pipe, always_xy=True).transform(lon, lat)
+    want = {tuple(int(np.floor(round(v / 0.01, 4))) for v in p) for p in zip(x, y, (50.0, 51.0, 52.5), strict=True)}
+    mine = set(zip(*(voxels.axis(k)[0].tolist() for k in range(3)), strict=True))
+    assert mine == want
+    assert any("no datum" in w.problem for w in context.warnings)
+
+
+def test_places_under_the_environments_datum() -> None:
+    frame = local_frame(Datum(53.21, -0.005, heading=30.0))
+    voxels, _, layers = read(FIELD, frame=frame)
+    assert layers.datum is None, "the environment keeps its own"
+    lon, lat = Transformer.from_crs("EPSG:32630", "EPSG:4326", always_xy=True).transform(700010, 5900020)
+    (x, y), *_ = frame.to_local(np.array([[lon, lat]]))
+    assert abs(x) < 1500
+    assert (np.floor(x / 0.05), np.floor(y / 0.05), 1050) in set(
+        zip(*(voxels.axis(k)[0].tolist() for k in range(3)), strict=True)
+    )
+
+
+def test_local_by_request_and_by_an_unknown_crs() -> None:
+    voxels, context, layers = read(FIELD, {"crs": "local", "origin": "700000,5900000,50"})
+    assert layers.datum is None
+    assert voxels.bounds() == (0.0, 0.0, 0.0, 10.05, 20.05, 2.55)
+    strange = FIELD.replace(struct.pack("<H", 32630), struct.pack("<H", 32599))
+    _, context, layers = read(strange)
+    assert layers.datum is None
+    assert any("not known" in w.problem for w in context.warnings)
+    assert any("taken as the local origin" in w.problem for w in context.warnings)
+
+
+def test_wkt_that_names_files_is_left_out() -> None:
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    wkt = 'GEOGCS["x",DATUM["y",SPHEROID["z",6378137,298.25]],EXTENSION["PROJ4","+proj=longlat +nadgrids=/etc/passwd"]]'
+    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = np.array([1.0]), np.array([2.0]), np.array([3.0])
+    out = io.BytesIO()
+    las.write(out)
+    _, context, layers = read(out.getvalue())
+    assert layers.datum is None
+    assert any("names files" in w.problem for w in context.warnings)
+
+
+def test_wkt_of_las_1_4_and_heights_in_feet() -> None:
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.offsets, header.scales = np.array([700000.0, 5900000.0, 0.0]), np.full(3, 0.001)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = np.array([700000.5]), np.array([5900000.5]), np.array([100.0])
+    las.header.add_crs(CRS("EPSG:32630+6360"))  # NAVD88 height in US survey feet
+    out = io.BytesIO()
+    las.write(out)
+    voxels, _, layers = read(out.getvalue())
+    assert layers.datum is not None
+    assert voxels.axis(2)[0].tolist() == [int(100 * 1200 / 3937 / 0.05)]
+
+
+def test_the_same_file_comes_back_and_the_other_kind_holds_the_same() -> None:
+    assert written({"a.las": FIELD}) == FIELD
+    assert written({"a.laz": SPIRAL}) == SPIRAL
+    for data, kind in ((FIELD, "laz"), (SPIRAL, "las")):
+        other = written({f"a.{'las' if kind == 'laz' else 'laz'}": data}, kind=kind)
+        a, b = points(data), points(other)
+        assert b.header.are_points_compressed == (kind == "laz")
+        assert np.array_equal(a.points.array, b.points.array)
+        assert list(a.header.scales) == list(b.header.scales)
+        assert list(a.header.offsets) == list(b.header.offsets)
+        assert a.header.creation_date == b.header.creation_date
+        assert [v.record_data_bytes() for v in a.vlrs] == [v.record_data_bytes() for v in b.vlrs]
+        assert written({f"a.{kind}": other}, kind=kind) == other
+    assert set(offline({"a.las": FIELD}, "las", options={"kind": "laz"}).files) == {"map.laz"}
+
+
+def test_dimensions_of_a_real_las_reach_the_others() -> None:
+    told, rows = clouds.pcd(written({"a.las": FIELD}, "pcd", frame="source"))
+    fields = told["FIELDS"].split()
+    assert fields[:4] == ["x", "y", "z", "intensity"]
+    assert {"return_number", "classification", "gps_time", "user_data", "point_source_id", "scan_angle_rank"} <= {
+        *fields
+    }
+    row = dict(zip(fields, rows[2], strict=True))
+    assert (row["x"], row["y"], row["z"]) == (700010.0, 5900020.0, 52.5)
+    assert (row["intensity"], row["gps_time"], row["classification"]) == (65535, 3.5, 2)
+    assert (row["scan_angle_rank"], row["user_data"], row["point_source_id"]) == (-3, 5, 9)
+
+
+def test_local_coordinates_in_other_formats_agree_with_the_voxels() -> None:
+    voxels, _, _ = read(FIELD)
+    _, rows = clouds.ply(written({"a.las": FIELD}, "ply"))
+    mine = {tuple(int(np.floor(v / 0.05)) for v in row[:3]) for row in rows}
+    assert mine == set(zip(*(voxels.axis(k)[0].tolist() for k in range(3)), strict=True))
+
+
+def test_another_cloud_as_las() -> None:
+    shelf = (SAMPLES / "pcd" / "shelf.pcd").read_bytes()
+    told = offline({"shelf.pcd": shelf}, "las")
+    las = points(told.files["map.las"])
+    assert ("points", 1) in [(d["what"], d["count"]) for d in told.report["dropped"]], "the NaN"
+    assert str(las.header.version) == "1.4"
+    assert las.point_format.id == 7
+    assert list(las.header.scales) == [0.001] * 3
+    truth = [p for p in clouds.pcd(shelf)[1] if p[0] == p[0]]
+    assert np.allclose(np.stack([las.x, las.y, las.z], 1), [p[:3] for p in truth], atol=0.0005)
+    assert las.red.tolist() == [(p[3] >> 16) * 257 for p in truth]
+    assert las["label"].tolist() == [p[4] for p in truth]
+    assert las["feature_1"].tolist() == [p[6] for p in truth]
+    assert told.files["map.las"][90:94] == bytes(4), "no date, so the same bytes tomorrow"
+    intensity = points(written({"i.pcd": (SAMPLES / "pcd" / "intensity.pcd").read_bytes()}))
+    assert intensity.point_format.id == 6
+    assert intensity.intensity.tolist() == [0, 10, 20, 30], "whole numbers are LAS's own intensity"
+
+
+def test_voxels_as_las_keep_their_voxels() -> None:
+    shed = (SAMPLES / "octomap" / "shed.bt").read_bytes()
+    las = points(written({"shed.bt": shed}))
+    res = float(shed.partition(b"\nres ")[2].split()[0])
+    voxels, _, _ = read(written({"shed.bt": shed}), {"resolution": repr(res)})
+    assert voxels.voxel_counts()["occupied"] == len(las.points) > 0
+    assert written({"shed.bt": shed}, kind="laz") == written({"shed.bt": shed}, kind="laz")
+
+
+def lying(data: bytes, at: int, form: str, value: int) -> bytes:
+    size = struct.calcsize(form)
+    return data[:at] + struct.pack(form, value) + data[at + size :]
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (FIELD[:200], "within the header"),
+        (lying(FIELD, 25, "<B", 9), "1.0 to 1.4"),
+        (lying(FIELD, 96, "<I", 2**31), "contradict"),
+        (lying(FIELD, 94, "<H", 10), "contradict"),
+        (lying(FIELD, 100, "<I", 2**32 - 1), "do not go before"),
+        (lying(FIELD, 107, "<I", 2**32 - 1), "limit"),
+        (lying(FIELD, 107, "<I", 4), "the file has"),
+        (lying(FIELD, 104, "<B", 11), "no point format"),
+        (lying(FIELD, 131, "<Q", 0x7FF0000000000000), "finite"),
+        (lying(SPIRAL, 247, "<Q", 2**63), "limit"),
+        (lying(SPIRAL, 243, "<I", 2**32 - 1), "do not go after"),
+        (lying(SPIRAL, POINTS, "<q", 5), "table of chunks"),
+        (lying(SPIRAL, struct.unpack_from("<q", SPIRAL, POINTS)[0] + 4, "<I", 2**31), "more chunks"),
+        (lying(SPIRAL, 375 + 54 + 32, "<H", 60000), "ends too early"),
+        (lying(SPIRAL, 375 + 54 + 36, "<H", 29), "LASzip record tells"),
+    ],
+)  # fmt: skip
+def test_lies_in_headers_are_found_before_anything_is_allocated(data: bytes, said: str) -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises((UnreadableFile, TooLarge), match=said) as caught:
+            read(data)
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()
+    assert caught.value.problems[0].file == "map.las"
+
+
+def test_limits_are_kept() -> None:
+    with pytest.raises(TooLarge, match="limit is 2"):
+        read(FIELD, limits=Limits(voxels=2))
+    with pytest.raises(TooLarge, match="bytes; the limit"):
+        read(SPIRAL, limits=Limits(unpacked_bytes=100))
+
+
+def test_damaged_compressed_points_are_refused_or_read(capfd: pytest.CaptureFixture[str]) -> None:
+    """Also where lazrs panics: its message goes to stderr, the exception is ours."""
+    dice = random.Random(7)
+    refused = 0
+    for _ in range(400):
+        data = bytearray(SPIRAL)
+        for _ in range(dice.choice([1, 1, 3, 9])):
+            data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)
+        cut = bytes(data[: dice.choice([len(data), len(data), dice.randrange(len(data))])])
+        try:
+            read_bundle({"a.laz": cut}, Hints("las"), Known(), Limits())
+        except BadUpload as error:
+            refused += 1
+            assert error.problems[0].file == "a.laz"
+    assert refused > 100
+    assert "Traceback" not in capfd.readouterr().err
