@@ -150,8 +150,8 @@ def _ancestry(layer: Layer, steps: Mapping[Layer, Step]) -> tuple[set[Step], set
         if step is None or step in done:
             continue
         done.add(step)
-        todo += [need for need in step.needs if need in steps]
-        roots |= {need for need in step.needs if need not in steps}
+        todo += [need for need in step.reads if need in steps]
+        roots |= {need for need in step.reads if need not in steps}
     return done, roots
 
 

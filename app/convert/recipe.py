@@ -144,15 +144,16 @@ def chain(
         available, best = _forced(known, available, without, frozenset(rest), derived=derived)
     if best is None:
         raise MissingLayer(f"{known.name} cannot be made: supply {' or '.join(missing(known, available))}")
-    carried = known.carries | {layer for step in best.steps for layer in step.needs}
+    carried = known.carries | {layer for step in best.steps for layer in step.reads}
     keys = sorted(k for k in available.keys if k.layer in carried)
     chosen: Sequence[PartKey] = [k for k in keys if k.layer in known.carries]
     if not any(step.gives in known.carries for step in best.steps):  # else it is chosen once all parts are there
         chosen = known.choose(chosen, options)
     needed = {layer for step in best.steps for layer in step.needs}
-    keys = sorted({*chosen, *(k for k in keys if k.layer in needed)})
     if not _is_whole(known, available):
-        _check_anchor(known, available, keys)
+        _check_anchor(known, available, sorted({*chosen, *(k for k in keys if k.layer in needed)}))
+    read = {layer for step in best.steps for layer in step.reads}
+    keys = sorted({*chosen, *(k for k in keys if k.layer in read)})
     remembered = {name: value for steps in available.pinned.values() for name, value in steps.items()}
     steps = [derive.with_values([s], {**remembered.get(s.name, {}), **asked})[0] for s in best.steps]
     return Chain(tuple(steps), tuple(keys))
@@ -209,7 +210,7 @@ def _forced(
 
 def needed(way: Chain) -> Chain:
     """The same with only those parts that its steps read."""
-    read = {layer for step in way.steps for layer in step.needs}
+    read = {layer for step in way.steps for layer in step.reads}
     return replace(way, keys=tuple(k for k in way.keys if k.layer in read))
 
 

@@ -49,7 +49,8 @@ Function = Callable[[Layers, Any, Notes], Layers]
 
 @dataclass(frozen=True, slots=True)
 class Derivation:
-    """One step. gives: the layer it makes. needs: the layers it reads. cost: relative effort and loss, above 0."""
+    """One step. gives: the layer it makes. needs: the layers it reads. also: stored layers that it uses a part of where
+    they are there, and does without where they are not. cost: relative effort and loss, above 0."""
 
     name: str
     title: str
@@ -59,6 +60,11 @@ class Derivation:
     version: int
     parameters: type[Any]
     function: Function
+    also: frozenset[Layer] = frozenset()
+
+    def step(self) -> Step:
+        """The derivation as it stands in a plan, with its default parameters."""
+        return Step(self.name, self.gives, tuple(sorted(self.needs)), self.version, (), tuple(sorted(self.also)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +76,12 @@ class Step:
     needs: tuple[Layer, ...]
     version: int
     given: tuple[tuple[str, Any], ...] = ()
+    also: tuple[Layer, ...] = ()
+
+    @property
+    def reads(self) -> frozenset[Layer]:
+        """All layers that it looks at."""
+        return frozenset((*self.needs, *self.also))
 
     def as_dict(self) -> dict[str, Any]:
         """The step in the contract's words, with all its parameters."""
@@ -90,7 +102,13 @@ _registry: dict[str, Derivation] = {}
 
 
 def derives(
-    gives: Layer, needs: set[Layer], *, parameters: type[Any], cost: float, version: int = 1
+    gives: Layer,
+    needs: set[Layer],
+    *,
+    parameters: type[Any],
+    cost: float,
+    version: int = 1,
+    also: frozenset[Layer] = frozenset(),
 ) -> Callable[[Function], Function]:
     """Declare a function as a derivation; its name is its id, its docstring's first line its title."""
 
@@ -99,7 +117,7 @@ def derives(
         if name in _registry:
             raise ValueError(f"derivation {name} is declared twice")
         title = (function.__doc__ or name).strip().splitlines()[0]
-        _registry[name] = Derivation(name, title, gives, frozenset(needs), cost, version, parameters, function)
+        _registry[name] = Derivation(name, title, gives, frozenset(needs), cost, version, parameters, function, also)
         return function
 
     return declare
@@ -136,8 +154,7 @@ def plan(available: frozenset[Layer], wanted: frozenset[Layer], without: frozens
         for d in all_derivations().values():
             if d.needs <= have and d.gives not in have and d.name not in without:
                 pushed += 1
-                step = Step(d.name, d.gives, tuple(sorted(d.needs)), d.version)
-                heapq.heappush(queue, (cost + d.cost, pushed, have | {d.gives}, (*steps, step)))
+                heapq.heappush(queue, (cost + d.cost, pushed, have | {d.gives}, (*steps, d.step())))
     return None
 
 

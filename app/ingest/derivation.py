@@ -55,7 +55,7 @@ def prepare_derivation(
     failed: list[str] = []
     while True:
         steps = _steps(known, frozenset(k.layer for k in stored), base, without, failed)
-        needed = {layer for step in steps for layer in step.needs}
+        needed = {layer for step in steps for layer in step.reads}
         used = {k: e for k, e in stored.items() if k.layer in needed}
         used |= {k: e for k, e in own.items() if known.gives in needed}
         # Not only the layers that are needed: a derivation may look at others where they are there (a fence).
@@ -102,7 +102,7 @@ def _steps(
         lacking = ", ".join(sorted(known.needs - have))
         tried = f"; what is stored does not do: {'; '.join(failed)}" if failed else ""
         raise MissingLayer(f"{known.name} needs {lacking}, and the environment has none: upload a map that has{tried}")
-    return (*before.steps, Step(known.name, known.gives, tuple(sorted(known.needs)), known.version))
+    return (*before.steps, known.step())
 
 
 def _check_values(wish: Wish, way: Sequence[Step]) -> None:

@@ -1,0 +1,380 @@
+"""Which cells of a grid, or of a stack of grids, triangles and polygons touch or enclose: exact, and without loops.
+
+Everything becomes **spans**: runs of cells (layer, row, first column, end column). A cell is touched where a surface
+meets it; it is enclosed where its middle lies inside. What ends exactly on the border of two cells belongs to the cell
+on its own inner side: triangles are moved a micrometre against their normals (counter-clockwise seen from outside) and
+outlines to their inner side, and what has an extent is half a micrometre shorter at its ends, so that a box of one
+metre covers ten cells of 0.1 m and not eleven.
+
+Inside is where the winding number of a closed surface is not zero, row by row: solids that overlap join, a solid with
+its inside turned out is a solid all the same, and a row in which a surface is open encloses nothing. Coordinates are
+counted in cells from the grid's corner once they are here; row 0 is the lowest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.errors import CannotConvert
+
+Array = NDArray[np.float64]
+Spans = NDArray[np.int64]
+"""int64 [n, 4]: layer, row, first column, end column (exclusive)."""
+
+INWARDS = 1e-6
+"""Metres that surfaces are moved inwards; half of it, their ends."""
+
+AT_ONCE = 2**18
+"""Triangles, or edges times the rows that they cross, that are worked on at a time."""
+
+NONE: Spans = np.empty((0, 4), np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """Where a grid lies: origin (x, y) of its lower left corner in metres, metres a cell, cells along x and y."""
+
+    origin: tuple[float, float]
+    resolution: float
+    width: int
+    height: int
+
+    @classmethod
+    def around(cls, box: tuple[float, float, float, float], resolution: float) -> Frame:
+        """The grid of whole cells around a box (min x, min y, max x, max y), its origin a multiple of a cell."""
+        first = [math.floor(v / resolution + 1e-6) for v in box[:2]]
+        end = [math.ceil(v / resolution - 1e-6) for v in box[2:]]
+        width, height = (max(1, b - a) for a, b in zip(first, end, strict=True))
+        return cls((round(first[0] * resolution, 9), round(first[1] * resolution, 9)), resolution, width, height)
+
+    @property
+    def cells(self) -> int:
+        """How many cells it has."""
+        return self.width * self.height
+
+    def of(self, xy: Array) -> Array:
+        """Metres [..., 2] as cells."""
+        return np.asarray((xy - np.array(self.origin)) / self.resolution, np.float64)
+
+
+# --- surfaces --------------------------------------------------------------------------------------------------------
+
+
+def surfaces(triangles: Array, frame: Frame, slabs: Array) -> Iterator[Spans]:
+    """The cells that triangles (float64 [n, 3, 3], metres) touch between the heights of each slab.
+
+    slabs: float64 [k, 2], low and high in metres, ascending and one after another, or one of any thickness; its number
+    is the spans' layer. A slab of no thickness is a slice.
+    """
+    if not len(triangles):
+        return
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    inner = np.divide(normal, length[:, None], out=np.zeros_like(normal), where=length[:, None] > 0)
+    moved = triangles - INWARDS * inner[:, None, :]
+    low, high = _shorter(moved[:, :, 2].min(axis=1), moved[:, :, 2].max(axis=1), INWARDS / 2)
+    xy = frame.of(moved[:, :, :2])
+    aside = (xy.max(axis=1) < 0).any(axis=1) | (xy.min(axis=1) > [frame.width, frame.height]).any(axis=1)
+    first = np.searchsorted(slabs[:, 1], low, side="left")
+    end = np.searchsorted(slabs[:, 0], high, side="right")
+    count = np.where(aside, 0, np.maximum(end - first, 0))
+    for chosen in _portions(count):
+        times = count[chosen]
+        owner = np.repeat(chosen, times)
+        layer = np.repeat(first[chosen], times) + _within(times)
+        corners = np.concatenate([xy[owner], moved[owner][:, :, 2:]], axis=2)
+        yield from _touched(*_clipped(corners, slabs[layer, 0], slabs[layer, 1]), layer, frame)
+
+
+def _clipped(corners: Array, low: Array, high: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Convex pieces of triangles [n, 3, 3] between two heights each: edges float64 [m, 2, 2] and whose they are.
+
+    A piece is what its edges' projections enclose; where a triangle only touches, an edge may be a point.
+    """
+    a, b = corners, np.roll(corners, -1, axis=1)
+    run = b[..., 2] - a[..., 2]
+    owner = np.repeat(np.arange(len(corners)), 3).reshape(-1, 3)
+    # The part of each edge between the heights, as parameters from a to b; level edges have none.
+    with np.errstate(all="ignore"):
+        t0, t1 = (low[:, None] - a[..., 2]) / run, (high[:, None] - a[..., 2]) / run
+    level = run == 0
+    within = (a[..., 2] >= low[:, None]) & (a[..., 2] <= high[:, None])
+    enter = np.where(level, np.where(within, 0.0, 2.0), np.clip(np.minimum(t0, t1), 0.0, None))
+    leave = np.where(level, 1.0, np.clip(np.maximum(t0, t1), None, 1.0))
+    there = enter <= leave
+    p = a[..., :2] + (b[..., :2] - a[..., :2]) * enter[..., None]
+    q = a[..., :2] + (b[..., :2] - a[..., :2]) * leave[..., None]
+    parts = [np.stack([p, q], axis=2)[there]]
+    owners = [owner[there]]
+    # Where the heights cut through, two edges meet the cut: the line between these points closes the piece.
+    for z in (low, high):
+        side = a[..., 2] > z[:, None]
+        crossing = side != np.roll(side, -1, axis=1)
+        cut = crossing.sum(axis=1) == 2
+        if cut.any():
+            with np.errstate(all="ignore"):
+                t = np.clip((z[:, None] - a[..., 2]) / run, 0.0, 1.0)
+                at = a[..., :2] + (b[..., :2] - a[..., :2]) * t[..., None]
+            parts.append(at[cut][crossing[cut]].reshape(-1, 2, 2))
+            owners.append(np.flatnonzero(cut))
+    return np.concatenate(parts), np.concatenate(owners)
+
+
+def _touched(edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], frame: Frame) -> Iterator[Spans]:
+    """The cells that convex pieces touch, a span for each row: between the leftmost and the rightmost of what their
+    edges (float64 [m, 2, 2], in cells) have in that row. layer: of each piece."""
+    order = np.argsort(owner, kind="stable")
+    edges, owner = edges[order], owner[order]
+    starts = np.flatnonzero(np.diff(owner, prepend=-1)) if len(owner) else np.empty(0, np.int64)
+    if not len(starts):
+        return
+    end = INWARDS / 2 / frame.resolution
+    y = edges[..., 1]
+    bottom, top = _shorter(np.minimum.reduceat(y.min(axis=1), starts), np.maximum.reduceat(y.max(axis=1), starts), end)
+    size = np.diff(np.append(starts, len(owner)))
+    low = np.maximum(np.floor(y.min(axis=1)), np.repeat(np.floor(bottom), size))
+    high = np.minimum(np.floor(y.max(axis=1)), np.repeat(np.floor(top), size))
+    low = np.clip(low, 0, frame.height).astype(np.int64)
+    high = np.clip(high, -1, frame.height - 1).astype(np.int64)
+    count = np.maximum(high - low + 1, 0)
+    of_piece = np.add.reduceat(count, starts)
+    bound = np.append(starts, len(owner))
+    for pieces in _portions(of_piece):
+        wanted = np.concatenate([np.arange(bound[pieces[0]], bound[pieces[-1] + 1])])
+        times = count[wanted]
+        which = np.repeat(wanted, times)
+        if not len(which):
+            continue
+        row = np.repeat(low[wanted], times) + _within(times)
+        (x0, y0), (x1, y1) = edges[which, 0].T, edges[which, 1].T
+        run = y1 - y0
+        with np.errstate(all="ignore"):
+            at0, at1 = (row - y0) / run, (row + 1 - y0) / run
+        flat = run == 0
+        t0 = np.where(flat, 0.0, np.clip(np.minimum(at0, at1), 0.0, 1.0))
+        t1 = np.where(flat, 1.0, np.clip(np.maximum(at0, at1), 0.0, 1.0))
+        left, right = x0 + (x1 - x0) * t0, x0 + (x1 - x0) * t1
+        key = owner[which] * frame.height + row
+        order = np.argsort(key, kind="stable")
+        begin = np.flatnonzero(np.diff(key[order], prepend=-1))
+        least = np.minimum.reduceat(np.minimum(left, right)[order], begin)
+        most = np.maximum.reduceat(np.maximum(left, right)[order], begin)
+        least, most = _shorter(least, most, end)
+        c0 = np.clip(np.floor(least), 0, frame.width).astype(np.int64)
+        c1 = np.clip(np.floor(most) + 1, 0, frame.width).astype(np.int64)
+        here = order[begin]
+        spans = np.column_stack([layer[owner[which[here]]], row[here], c0, c1])
+        yield spans[c1 > c0]
+
+
+def _shorter(low: Array, high: Array, end: float) -> tuple[Array, Array]:
+    """Ranges without their ends; of short ones the middle is left."""
+    less = np.minimum(end, (high - low) / 2)
+    return low + less, high - less
+
+
+# --- insides ---------------------------------------------------------------------------------------------------------
+
+
+def insides(triangles: Array, owner: NDArray[np.int64], frame: Frame, heights: Array) -> Iterator[Spans]:
+    """The cells whose middle lies inside solids at each of the heights (metres, ascending): the height's number is the
+    spans' layer. owner: int64 [n], the solid that a triangle belongs to; a solid is judged on its own."""
+    if not len(triangles):
+        return
+    z = triangles[:, :, 2]
+    first = np.searchsorted(heights, z.min(axis=1), side="left")  # a vertex at a height counts as below it
+    end = np.searchsorted(heights, z.max(axis=1), side="left")
+    count = np.maximum(end - first, 0)
+    # A solid's crossings at one height must be looked at together.
+    solids, of_solid = np.unique(owner, return_inverse=True)
+    load = np.bincount(of_solid, count, len(solids)).astype(np.int64)
+    order = np.argsort(of_solid, kind="stable")
+    bound = np.append(0, np.cumsum(np.bincount(of_solid, minlength=len(solids))))
+    for chosen in _portions(load):
+        which = order[bound[chosen[0]] : bound[chosen[-1] + 1]]
+        times = count[which]
+        index = np.repeat(which, times)
+        layer = np.repeat(first[which], times) + _within(times)
+        if len(index):
+            a = triangles[index]
+            ends, through = _crossings(a, heights[layer])
+            group = of_solid[index] * len(heights) + layer
+            yield from _enclosed(frame.of(ends[through]), group[through], len(heights), frame)
+
+
+def _crossings(corners: Array, height: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Where triangles cross a height each: from the edge that goes up to the edge that comes down, float64 [n, 2, 2],
+    and which triangles do."""
+    a, b = corners, np.roll(corners, -1, axis=1)
+    above = a[..., 2] > height[:, None]
+    then = np.roll(above, -1, axis=1)
+    up, down = ~above & then, above & ~then
+    through: NDArray[np.bool_] = np.asarray(up.any(axis=1))
+    with np.errstate(all="ignore"):
+        t = (height[:, None] - a[..., 2]) / (b[..., 2] - a[..., 2])
+        at = a[..., :2] + (b[..., :2] - a[..., :2]) * t[..., None]
+    n = np.arange(len(corners))
+    return np.stack([at[n, up.argmax(axis=1)], at[n, down.argmax(axis=1)]], axis=1), through
+
+
+def _enclosed(edges: Array, group: NDArray[np.int64], layers: int, frame: Frame) -> Iterator[Spans]:
+    """The cells whose middle lies inside closed directed edges (float64 [m, 2, 2], in cells), each group on its own;
+    the layer is the group modulo ``layers``."""
+    y0, y1 = edges[:, 0, 1], edges[:, 1, 1]
+    low = np.clip(np.ceil(np.minimum(y0, y1) - 0.5), 0, frame.height).astype(np.int64)
+    end = np.clip(np.ceil(np.maximum(y0, y1) - 0.5), 0, frame.height).astype(np.int64)
+    count = np.maximum(end - low, 0)
+    groups, of_group = np.unique(group, return_inverse=True)
+    load = np.bincount(of_group, count, len(groups)).astype(np.int64)
+    order = np.argsort(of_group, kind="stable")
+    bound = np.append(0, np.cumsum(np.bincount(of_group, minlength=len(groups))))
+    for chosen in _portions(load):
+        which = order[bound[chosen[0]] : bound[chosen[-1] + 1]]
+        times = count[which]
+        index = np.repeat(which, times)
+        if not len(index):
+            continue
+        row = np.repeat(low[which], times) + _within(times)
+        (ax, ay), (bx, by) = edges[index, 0].T, edges[index, 1].T
+        x = ax + (bx - ax) * ((row + 0.5 - ay) / (by - ay))
+        sign = np.where(by > ay, 1, -1)
+        column = np.clip(np.ceil(x - 0.5), 0, frame.width).astype(np.int64)
+        key = of_group[index] * frame.height + row
+        sort = np.lexsort((column, key))
+        key, column, sign, row, index = key[sort], column[sort], sign[sort], row[sort], index[sort]
+        begin = np.flatnonzero(np.diff(key, prepend=-1))
+        size = np.diff(np.append(begin, len(key)))
+        total = np.add.reduceat(sign, begin)
+        winding = np.cumsum(sign)
+        winding -= np.repeat((winding - sign)[begin], size)
+        closed = np.repeat(total == 0, size)
+        inside = closed & (winding != 0)
+        at = np.flatnonzero(inside)  # never a row's last crossing: there the winding of a closed row is 0 again
+        spans = np.column_stack([groups[of_group[index[at]]] % layers, row[at], column[at], column[at + 1]])
+        yield spans[spans[:, 3] > spans[:, 2]]
+
+
+# --- polygons --------------------------------------------------------------------------------------------------------
+
+
+def areas(polygons: Iterable[object], frame: Frame, *, touched: bool) -> Iterator[Spans]:
+    """The cells that polygons (shapely, metres) enclose, and with ``touched`` also those that their outlines meet.
+    The layer is 0. Lines and points count by the cells that they touch, in both cases."""
+    parts = shapely.get_parts(np.array(list(polygons), object))
+    parts = parts[~shapely.is_empty(parts)]
+    flat = shapely.get_type_id(parts) == 3
+    rings, owner = shapely.get_rings(shapely.orient_polygons(parts[flat]), return_index=True)
+    edges, of_ring = _edges(rings)
+    if len(edges):
+        yield from _enclosed(frame.of(edges), owner[of_ring], 1, frame)
+    if touched and len(edges):
+        step = edges[:, 1] - edges[:, 0]
+        length = np.linalg.norm(step, axis=1)
+        left = np.column_stack([-step[:, 1], step[:, 0]])
+        left = np.divide(left, length[:, None], out=np.zeros_like(left), where=length[:, None] > 0)
+        yield from _lines(edges + INWARDS * left[:, None, :], frame)
+    others = parts[~flat]
+    lines, _ = _edges(others[np.isin(shapely.get_type_id(others), (1, 2))])
+    yield from _lines(lines, frame)
+    at = shapely.get_coordinates(others[shapely.get_type_id(others) == 0])
+    yield from _lines(np.stack([at, at], axis=1), frame)
+
+
+def _lines(edges: Array, frame: Frame) -> Iterator[Spans]:
+    if len(edges):
+        xy = frame.of(edges)
+        aside = (xy.max(axis=1) < 0).any(axis=1) | (xy.min(axis=1) > [frame.width, frame.height]).any(axis=1)
+        xy = xy[~aside]
+        yield from _touched(xy, np.arange(len(xy)), np.zeros(len(xy), np.int64), frame)
+
+
+def _edges(lines: NDArray[np.object_]) -> tuple[Array, NDArray[np.int64]]:
+    """Consecutive vertices of lines or rings as float64 [m, 2, 2], and whose they are."""
+    at, owner = shapely.get_coordinates(lines, return_index=True)
+    same = owner[1:] == owner[:-1]
+    return np.stack([at[:-1], at[1:]], axis=1)[same], owner[:-1][same]
+
+
+# --- from spans to cells ---------------------------------------------------------------------------------------------
+
+
+def paint(cells: NDArray[np.uint8], spans: Iterable[Spans], value: int) -> None:
+    """Give the cells of spans (of any layer) a value; cells: uint8 [height, width], row 0 the lowest."""
+    width = cells.shape[1]
+    rows = max(1, 2**22 // width)
+    for part in spans:
+        if not len(part):
+            continue
+        ordered = part[np.argsort(part[:, 1], kind="stable")]
+        for low in range(int(ordered[0, 1]) // rows * rows, int(ordered[-1, 1]) + 1, rows):
+            a, b = np.searchsorted(ordered[:, 1], (low, low + rows))
+            here = ordered[a:b]
+            if not len(here):
+                continue
+            low_row, high_row = int(here[0, 1]), int(here[-1, 1]) + 1
+            left, right = int(here[:, 2].min()), int(here[:, 3].max())
+            depth = np.zeros((high_row - low_row, right - left + 1), np.int32)
+            np.add.at(depth, (here[:, 1] - low_row, here[:, 2] - left), 1)
+            np.add.at(depth, (here[:, 1] - low_row, here[:, 3] - left), -1)
+            np.cumsum(depth, axis=1, out=depth)
+            cells[low_row:high_row, left:right][depth[:, :-1] > 0] = value
+
+
+def expanded(spans: Spans) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """(layer, row, column) of every cell of the spans, with repeats."""
+    times = spans[:, 3] - spans[:, 2]
+    layer, row = np.repeat(spans[:, 0], times), np.repeat(spans[:, 1], times)
+    return layer, row, np.repeat(spans[:, 2], times) + _within(times)
+
+
+def grown(cells: NDArray[np.uint8], value: int, distance: float) -> None:
+    """Give a value to all cells whose middle is at most ``distance`` (in cells) from the middle of one that has it."""
+    import cv2
+
+    if distance <= 0 or not (cells == value).any():
+        return
+    height, width = cells.shape
+    margin = math.ceil(distance) + 1
+    rows = max(margin, 2**24 // width)
+    source = cells.copy()
+    for low in range(0, height, rows):
+        top, end = max(0, low - margin), min(height, low + rows + margin)
+        there = source[top:end] == value
+        if there.any():
+            away = cv2.distanceTransform((~there).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+            here = away[low - top : low - top + rows] <= distance + 1e-4
+            cells[low : low + rows][here] = value
+
+
+def limited(frame: Frame, most: int, longest: int) -> Frame:
+    """The frame; CannotConvert where it has more cells than ``most`` or a side longer than ``longest`` cells."""
+    if frame.cells > most or max(frame.width, frame.height) > longest:
+        side = max(frame.width, frame.height) * frame.resolution
+        needed = max(math.sqrt(frame.cells * frame.resolution**2 / most), side / longest)
+        raise CannotConvert(
+            f"{frame.width} × {frame.height} cells of {frame.resolution:g} m are needed; the limit is {most} cells and "
+            f"{longest} along a side: ask for a resolution of at least {needed:.3g} m, or supply a smaller fence"
+        )
+    return frame
+
+
+def _within(times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """0 … n-1 for each n, one after another."""
+    return np.arange(int(times.sum())) - np.repeat(np.cumsum(times) - times, times)
+
+
+def _portions(load: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Consecutive indexes whose loads together are about AT_ONCE; none that has no load at the ends of the list."""
+    if not len(load) or not int(load.sum()):
+        return
+    bucket = (np.cumsum(load) - load) // AT_ONCE
+    cuts = np.flatnonzero(np.diff(bucket)) + 1
+    for part in np.split(np.arange(len(load)), cuts):
+        if int(load[part].sum()):
+            yield part

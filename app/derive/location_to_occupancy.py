@@ -1,0 +1,46 @@
+"""Location -> occupancy: a blank grid of the fence, to draw on or to drive by GNSS alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import shapely
+
+from app.derive import Notes, derives
+from app.derive._obstacles import fences
+from app.derive.objects_to_occupancy import RESOLUTION, blank, framed
+from app.errors import MissingLayer
+from app.model.grid import OccupancyGrid
+from app.model.layers import MAP, Layers, Part, PartKey
+from app.parameters import parameter
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """How fine."""
+
+    resolution: float | None = parameter(
+        None,
+        f"metres a cell; default: {RESOLUTION}, or as much coarser as keeps a grid below 2^25 cells",
+        minimum=1e-3,
+        maximum=100.0,
+        unit="m",
+    )
+
+
+@derives(gives="occupancy", needs={"location"}, parameters=Parameters, cost=50.0)
+def location_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+    """A blank occupancy grid: free inside the fence, unknown outside; it knows of no obstacle.
+
+    The origin is a whole multiple of the resolution, yaw 0. Raises MissingLayer where there is a datum but no fence,
+    CannotConvert where the grid would be too large.
+    """
+    parts: dict[PartKey, Part] = {}
+    for level, fence in fences(layers, notes).items():
+        frame = framed(shapely.bounds(fence).tolist(), parameters.resolution, notes)
+        cells = blank(frame, fence, [])
+        parts[PartKey("occupancy", level, MAP)] = OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
+    if not parts:
+        raise MissingLayer("a blank grid needs a fence: upload a datum.yaml with gnss_fence, or a drawing as location")
+    notes.warn("the grid is blank: it is free wherever the fence allows, and knows of no obstacle")
+    return Layers(parts, layers.datum, layers.levels)

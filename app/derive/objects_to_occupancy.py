@@ -1,0 +1,183 @@
+"""Objects -> occupancy: a world, a building or a town as the grid that a robot's laser would see, or a whole robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import Notes, _raster, derives
+from app.derive._obstacles import Site, fence_of, fences, sites
+from app.derive._raster import Frame
+from app.errors import Invalid, MissingLayer, Problem
+from app.model.frame import GROUND
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import MAP, Layers, Part, PartKey
+from app.parameters import parameter
+
+HEIGHT = 0.2
+"""Metres above the floor at which a slice is taken unless asked otherwise: a usual height of a robot's laser."""
+
+RESOLUTION = 0.05
+"""Metres a cell unless asked otherwise."""
+
+COARSER = (RESOLUTION, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+"""What is taken where a finer one would give a grid that no robot loads."""
+
+EASY = 2**25
+"""Cells up to which the usual resolution is kept."""
+
+MOST = 2**28
+"""Cells of a grid whatever was asked for (``Limits.pixels``)."""
+
+LONGEST = 32767
+"""Cells along a side: beyond it Nav2's map_server refuses the map."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """At which height, how fine, and how much is added around."""
+
+    height: float | None = parameter(
+        None,
+        f"a slice at this height above the level's floor; default: {HEIGHT}, as a laser sees",
+        minimum=-1e4,
+        maximum=1e4,
+        unit="m",
+    )
+    band: tuple[float, float] | None = parameter(
+        None,
+        "low,high: all that stands between two heights above the level's floor, instead of a slice",
+        minimum=-1e4,
+        maximum=1e4,
+        unit="m",
+    )
+    resolution: float | None = parameter(
+        None,
+        f"metres a cell; default: {RESOLUTION}, or as much coarser as keeps a grid below 2^25 cells",
+        minimum=1e-3,
+        maximum=100.0,
+        unit="m",
+    )
+    inflate: float = parameter(0.0, "how far obstacles are grown", minimum=0.0, maximum=100.0, unit="m")
+    padding: float = parameter(
+        1.0, "free space around everything, where no fence says how far the site reaches", minimum=0.0, maximum=1000.0
+    )
+    doors: Literal["open", "closed"] = parameter("open", "whether doors let a robot through")
+    visuals: bool = parameter(False, "whether shapes that are only seen and collide with nothing count")
+
+
+@derives(
+    gives="occupancy",
+    needs={"objects"},
+    also=frozenset({"resources", "location"}),
+    parameters=Parameters,
+    cost=4.0,
+)
+def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+    """What stands on the ground at a height, as an occupancy grid for each level.
+
+    Solids are cut, footprints rasterised; every cell that an obstacle touches is occupied. Free: the floors where there
+    are any, else the fence, else the box around everything with its padding; elsewhere unknown. The origin is a whole
+    multiple of the resolution, yaw 0. Raises MissingLayer where nothing stands in a robot's way, MissingDatum where the
+    objects are places on earth and there is none.
+    """
+    if parameters.height is not None and parameters.band is not None:
+        raise Invalid("height and band exclude each other", [Problem("give height or band", where="band")])
+    height = HEIGHT if parameters.height is None else parameters.height
+    low, high = parameters.band or (height, height)
+    if low > high:
+        raise Invalid("band: the low height comes first", [Problem("the low height comes first", where="band")])
+    known = sites(layers, notes, doors_closed=parameters.doors == "closed", visuals=parameters.visuals)
+    around = fences(layers, notes)
+    parts: dict[PartKey, Part] = {}
+    reach: list[tuple[float, float]] = []
+    for level, site in known.items():
+        fence = fence_of(around, level, GROUND)
+        grid = _grid(site, fence, (low, high), parameters, level, notes)
+        if grid is not None:
+            parts[PartKey("occupancy", level, MAP)] = grid
+        elif len(site.triangles):
+            reach.append((float(site.triangles[:, :, 2].min()), float(site.triangles[:, :, 2].max())))
+    if not parts:
+        there = (
+            f"; the solids reach from {min(r[0] for r in reach):g} to {max(r[1] for r in reach):g} m" if reach else ""
+        )
+        what = f"at {low:g} m above the floor" if low == high else f"between {low:g} and {high:g} m above the floor"
+        raise MissingLayer(
+            f"no stored object stands in a robot's way {what}{there}: ask for another height or band, or upload walls, "
+            "buildings, barriers, trees or a world with solids"
+        )
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def _grid(
+    site: Site, fence: Any, band: tuple[float, float], parameters: Parameters, level: str, notes: Notes
+) -> OccupancyGrid | None:
+    """A level's grid; None where nothing stands in the way and no floor says what is free."""
+    low, high = band
+    meets = (site.triangles[:, :, 2].min(axis=1) <= high) & (site.triangles[:, :, 2].max(axis=1) >= low)
+    # A solid around the band without a surface in it still fills it.
+    meets = np.isin(site.owner, np.unique(site.owner[_spans(site, low)])) | meets
+    standing = [f for f, b, t in zip(site.footprints, site.base, site.top, strict=True) if b <= high and t > low]
+    if not standing and not meets.any() and not site.free:
+        return None
+    here = Site(standing, triangles=site.triangles[meets], owner=site.owner[meets], free=site.free)
+    if not here.count:
+        notes.warn(f"nothing stands in a robot's way on the level {level}: all of its floor is free", where=level)
+    box = here.bounds() if fence is None else tuple(shapely.bounds(fence).tolist())
+    if box is None:
+        return None
+    if fence is None:
+        pad = parameters.padding
+        box = (box[0] - pad, box[1] - pad, box[2] + pad, box[3] + pad)
+    elif here.count and not shapely.box(*(here.bounds() or box)).intersects(fence):
+        notes.warn(f"all obstacles of the level {level} lie outside the fence", where=level)
+    frame = framed(box, parameters.resolution, notes)
+    cells = blank(frame, fence, site.free)
+    slab = np.array([[low, high]])
+    _raster.paint(cells, _raster.surfaces(here.triangles, frame, slab), OCCUPIED)
+    _raster.paint(cells, _raster.insides(here.triangles, here.owner, frame, slab[:, 0]), OCCUPIED)
+    _raster.paint(cells, _raster.areas(standing, frame, touched=True), OCCUPIED)
+    _raster.grown(cells, OCCUPIED, parameters.inflate / frame.resolution)
+    return OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
+
+
+def _spans(site: Site, height: float) -> NDArray[np.bool_]:
+    """The triangles of solids that reach from below a height to above it."""
+    if not len(site.triangles):
+        return np.zeros(0, bool)
+    owners, index = np.unique(site.owner, return_inverse=True)
+    least, most = np.full(len(owners), np.inf), np.full(len(owners), -np.inf)
+    np.minimum.at(least, index, site.triangles[:, :, 2].min(axis=1))
+    np.maximum.at(most, index, site.triangles[:, :, 2].max(axis=1))
+    return np.asarray(((least <= height) & (most > height))[index])
+
+
+def framed(box: tuple[float, ...], resolution: float | None, notes: Notes) -> Frame:
+    """The grid around a box (min x, min y, max x, max y in metres). CannotConvert where it would be too large."""
+    low_x, low_y, high_x, high_y = box[:4]
+    if resolution is not None:
+        return _raster.limited(Frame.around((low_x, low_y, high_x, high_y), resolution), MOST, LONGEST)
+    frame = Frame.around((low_x, low_y, high_x, high_y), COARSER[0])
+    for coarser in COARSER:
+        frame = Frame.around((low_x, low_y, high_x, high_y), coarser)
+        if frame.cells <= EASY and max(frame.width, frame.height) <= LONGEST:
+            break
+    if frame.resolution != RESOLUTION:
+        side = f"{high_x - low_x:.0f} × {high_y - low_y:.0f} m"
+        notes.fill("resolution", frame.resolution, f"{RESOLUTION} m would be too many cells for {side}")
+    return _raster.limited(frame, MOST, LONGEST)
+
+
+def blank(frame: Frame, fence: Any, free: list[Any]) -> NDArray[np.uint8]:
+    """Cells, uint8 [height, width], that are free on the floors, within the fence, or all where there is neither."""
+    cells = np.full((frame.height, frame.width), FREE if fence is None and not free else UNKNOWN, np.uint8)
+    inside = free
+    if fence is not None:
+        inside = [shapely.intersection(fence, ground) for ground in free] if free else [fence]
+    _raster.paint(cells, _raster.areas([g for g in inside if g.area > 0], frame, touched=False), FREE)
+    return cells

@@ -1,0 +1,113 @@
+"""A town, a building or a fence alone gives a grid and an octree, over HTTP, with a true report."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from tests.api.conftest import Api
+
+TOWN = b"""<osm version="0.6">
+<node id="1" lat="52.0" lon="10.0"/><node id="2" lat="52.0" lon="10.0001"/><node id="3" lat="52.0001" lon="10.0001"/>
+<node id="4" lat="52.0001" lon="10.0"/><node id="5" lat="52.0002" lon="10.0003"><tag k="natural" v="tree"/></node>
+<way id="9"><nd ref="1"/><nd ref="2"/><nd ref="3"/><nd ref="4"/><nd ref="1"/><tag k="building" v="yes"/></way>
+<way id="8"><nd ref="1"/><nd ref="2"/><tag k="highway" v="footway"/></way>
+</osm>"""
+
+FENCE = b"""datum_latitude: 52.0
+datum_longitude: 10.0
+gnss_fence:
+  gnss_fence_coords: [[52.0, 10.0], [52.0, 10.0002], [52.0002, 10.0002], [52.0002, 10.0]]
+"""
+
+
+def made(api: Api, env: str, query: str = "") -> tuple[Any, dict[str, Any]]:
+    """(cells as grey values, top row first; what the YAML says)"""
+    answer = api.get(f"environments/{env}/versions/latest/maps/occupancy_grid{query}")
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as z:
+        said = yaml.safe_load(z.read("map.yaml"))
+        return np.asarray(Image.open(io.BytesIO(z.read(said["image"])))), said
+
+
+def told(api: Api, env: str, query: str = "") -> dict[str, Any]:
+    report: dict[str, Any] = api.get(f"environments/{env}/versions/latest/reports/occupancy_grid{query}").json()
+    return report
+
+
+def test_a_town_alone_gives_a_grid(api: Api) -> None:
+    api.post("environments", {"name": "hamlet"})
+    api.upload("hamlet", {"map.osm": TOWN})
+    rows = {row["format"]: row for row in api.get("environments/hamlet/versions/latest/maps").json()}
+    assert rows["occupancy_grid"]["state"] == "derivable"
+    assert [s["step"] for s in rows["occupancy_grid"]["chain"]] == ["objects_to_occupancy"]
+    assert rows["octomap"]["state"] == "derivable"
+    grey, said = made(api, "hamlet")
+    assert said["resolution"] == 0.05
+    assert (grey == 0).sum() * 0.05**2 == pytest.approx(6.864 * 11.127, rel=0.03), "a house of 6.86 m × 11.13 m"
+    report = told(api, "hamlet")
+    line = next(line for line in report["layers"] if line["layer"] == "occupancy")
+    assert line["information"] == "derived"
+    assert line["sources"] == ["map.osm"]
+    assert line["steps"][0]["step"] == "objects_to_occupancy"
+    _, coarse = made(api, "hamlet", "?resolution=0.5&inflate=1")
+    assert coarse["resolution"] == 0.5
+    assert api.get("/maps/hamlet/octomap").content.startswith(b"# Octomap OcTree binary file")
+    for wrong in ("?resolution=0.0001", "?band=3,1", "?height=1&band=0,1", "?height=-5", "?doors=ajar"):
+        problem: Any = api.get(f"/maps/hamlet/occupancy_grid{wrong}", expect=None)
+        assert problem.status_code == 422, (wrong, problem.text)
+        assert problem.json()["detail"]
+
+
+def test_a_fence_alone_gives_a_blank_grid_and_bounds_a_derived_one(api: Api) -> None:
+    api.post("environments", {"name": "paddock"})
+    api.upload("paddock", {"datum.yaml": FENCE})
+    grey, _ = made(api, "paddock")
+    assert set(np.unique(grey)) <= {205, 254}
+    assert any("blank" in w["problem"] for w in told(api, "paddock")["warnings"])
+    api.upload("paddock", {"map.osm": TOWN})
+    grey, said = made(api, "paddock")
+    assert said["origin"] == [0, 0, 0]
+    assert (grey.shape[1] * 0.05, grey.shape[0] * 0.05) == (
+        pytest.approx(13.73, abs=0.1),
+        pytest.approx(22.25, abs=0.1),
+    )
+    assert (grey == 0).sum() > 10_000
+    line = next(line for line in told(api, "paddock")["layers"] if line["layer"] == "occupancy")
+    assert sorted(line["sources"]) == ["datum.yaml", "map.osm"]
+
+
+def test_a_drawing_of_regions_is_no_obstacle_and_says_so(api: Api) -> None:
+    api.post("environments", {"name": "sketch"})
+    square = [[0.001, 0], [0.002, 0], [0.002, 0.001], [0.001, 0]]
+    drawing = {
+        "type": "FeatureCollection",
+        "features": [{"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [square]}}],
+    }
+    import json
+
+    api.upload("sketch", {"a.geojson": json.dumps(drawing).encode()})
+    refused: Any = api.get("/maps/sketch/occupancy_grid", expect=None)
+    assert refused.status_code == 422
+    assert "stands in a robot's way" in refused.json()["detail"]
+
+
+def test_real_buildings_and_towns(api: Api, shared: Path) -> None:
+    data = shared / "data"
+    buildings = ("hotel/hotel.building.yaml", "office/office.building.yaml", "robast_sim/tiplu.building.yaml")
+    for name, path in {
+        **{b.split("/")[0].replace("_", "-"): data / "openrmf_building" / b for b in buildings},
+        "netherlands": data / "osm/urban-netherlands-subburbs/osm.xml",
+    }.items():
+        api.post("environments", {"name": name})
+        api.upload(name, {path.name: path.read_bytes()})
+        level = "?level=L2" if name == "hotel" else ""
+        grey, _ = made(api, name, level)
+        assert (grey == 0).sum() > 1000
+        assert (grey == 254).sum() > 10_000

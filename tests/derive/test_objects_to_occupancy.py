@@ -1,0 +1,398 @@
+"""Objects as a grid: what stands in the way at a height, what is free, and what it says when there is nothing."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from app import bundle, derive, parameters
+from app.bundle import Hints, Known
+from app.derive import Notes
+from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
+from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer
+from app.formats import Limits
+from app.model.features import Features, features
+from app.model.frame import Datum, Level
+from app.model.grid import OccupancyGrid
+from app.model.layers import MAP, SITE, Layers, Part, PartKey, Resources
+from tests.model.test_meshes import stl
+
+BOX = {"type": "box", "size": [1, 2, 3], "pose": [0, 0, 1.5, 0, 0, 0]}
+DATUM = Datum(52.0, 10.0)
+
+
+def objects(*rows: tuple[Any, dict[str, Any]], anchor: Any = "local") -> Features:
+    return features([(f"o{k}", geometry, said) for k, (geometry, said) in enumerate(rows)], anchor)
+
+
+def layers(part: Features, *, level: str = "ground", **more: Any) -> Layers:
+    parts: dict[PartKey, Part] = {PartKey("objects", level, "test"): part}
+    if "fence" in more:
+        fence = features([("fence", more.pop("fence"), {"kind": "fence"})], more.pop("anchor", "local"))
+        parts[PartKey("location", "ground", SITE)] = fence
+    if "files" in more:
+        parts[PartKey("resources", "ground", "test")] = Resources(more.pop("files"))
+    return Layers(parts, **more)
+
+
+def grid(content: Layers, notes: Notes | None = None, level: str = "ground", **options: Any) -> OccupancyGrid:
+    made = objects_to_occupancy(content, Parameters(**options), notes if notes is not None else Notes())
+    part = made.parts[PartKey("occupancy", level, MAP)]
+    assert isinstance(part, OccupancyGrid)
+    assert part.origin[2] == 0
+    for k in (0, 1):
+        whole = part.origin[k] / part.resolution
+        assert whole == pytest.approx(round(whole), abs=1e-6)
+    return part
+
+
+def at(g: OccupancyGrid, x: float, y: float) -> int:
+    column, row = int((x - g.origin[0]) // g.resolution), int((y - g.origin[1]) // g.resolution)
+    return int(g.cells[row, column]) if 0 <= row < g.height and 0 <= column < g.width else 255
+
+
+def occupied(g: OccupancyGrid) -> float:
+    """Square metres."""
+    return float((g.cells == 100).sum() * g.resolution**2)
+
+
+def test_solids_are_cut_at_the_laser_and_filled() -> None:
+    turned = {"kind": "model", "shapes": [BOX], "pose": [5, 5, 0, 0, 0, math.pi / 2]}
+    g = grid(layers(objects((shapely.Point(5, 5), turned))))
+    assert occupied(g) == pytest.approx(2)
+    assert (at(g, 5, 5), at(g, 5.9, 5.4), at(g, 5, 5.6), at(g, 3.2, 4)) == (100, 100, 0, 0)
+    assert (g.width, g.height) == (80, 60), "a metre of padding around"
+    assert set(np.unique(g.cells)) == {0, 100}
+
+
+def test_height_and_band() -> None:
+    table = {
+        "kind": "model",
+        "shapes": [
+            {"type": "box", "size": [2, 2, 0.1], "pose": [0, 0, 0.75, 0, 0, 0]},
+            {"type": "cylinder", "radius": 0.1, "length": 0.7, "pose": [0, 0, 0.35, 0, 0, 0]},
+        ],
+    }
+    content = layers(objects((shapely.Point(0, 0), table)))
+    assert occupied(grid(content)) == pytest.approx(math.pi * 0.01, rel=0.7)
+    assert occupied(grid(content, height=0.75)) == pytest.approx(4)
+    assert occupied(grid(content, band=(0.1, 1.0))) == pytest.approx(4)
+    assert occupied(grid(content, band=(0.1, 0.6))) == pytest.approx(math.pi * 0.01, rel=0.7)
+    with pytest.raises(MissingLayer, match=r"at 2 m above the floor; the solids reach from 0 to 0\.8 m"):
+        grid(content, height=2.0)
+    with pytest.raises(MissingLayer, match="between 2 and 3 m"):
+        grid(content, band=(2.0, 3.0))
+
+
+def test_a_band_inside_a_solid_is_full() -> None:
+    g = grid(layers(objects((None, {"kind": "model", "shapes": [BOX]}))), band=(1.0, 1.1), padding=0.0)
+    assert (g.cells == 100).all()
+    assert occupied(g) == pytest.approx(2)
+
+
+def test_a_hollow_wall_stays_hollow() -> None:
+    """A ring-shaped room as one closed mesh: the room inside is free."""
+    rings = [[[-3, -3], [3, -3], [3, 3], [-3, 3]], [[-2.5, -2.5], [2.5, -2.5], [2.5, 2.5], [-2.5, 2.5]]]
+    g = grid(layers(objects((None, {"kind": "model", "shapes": [{"type": "polyline", "points": rings, "height": 2}]}))))
+    assert occupied(g) == pytest.approx(36 - 25)
+    assert at(g, 0, 0) == 0
+
+
+def test_levels_have_their_own_floor() -> None:
+    upstairs = {"kind": "model", "shapes": [BOX], "pose": [0, 0, 10, 0, 0, 0]}
+    content = Layers(
+        {
+            PartKey("objects", "ground", "a"): objects((shapely.box(0, 0, 1, 1), {"kind": "building"})),
+            PartKey("objects", "L2", "a"): objects((None, upstairs)),
+        },
+        levels=(Level(), Level("L2", 10.0)),
+    )
+    assert occupied(grid(content)) == pytest.approx(1)
+    assert occupied(grid(content, level="L2")) == pytest.approx(2)
+
+
+def test_walls_doors_floors_and_holes_of_a_building() -> None:
+    floor = shapely.box(0, 0, 10, 6)
+    rows: list[Any] = [
+        (floor, {"kind": "floor"}),
+        (shapely.LineString([(0, 0), (10, 0)]), {"kind": "wall"}),
+        (shapely.LineString([(4, 0), (4, 6)]), {"kind": "wall", "width": 0.5}),
+        (shapely.LineString([(0, 6), (3, 6)]), {"kind": "door", "name": "d"}),
+        (shapely.box(8, 4, 9, 5), {"kind": "hole"}),
+        (shapely.LineString([(5, 1), (5, 5)]), {"kind": "measurement"}),
+        (shapely.Point(6, 3), {"kind": "fiducial"}),
+    ]
+    notes = Notes()
+    g = grid(layers(objects(*rows)), notes)
+    assert (at(g, 2, 3), at(g, 11 - 0.2, 3), at(g, -0.5, -0.5)) == (0, 255, 255)
+    assert (at(g, 5, 0.02), at(g, 5, -0.02), at(g, 4.2, 3), at(g, 4.3, 3), at(g, 8.5, 4.5)) == (100, 100, 100, 0, 100)
+    assert (at(g, 5, 3), at(g, 6, 3), at(g, 1.5, 5.98)) == (0, 0, 0)
+    assert at(grid(layers(objects(*rows)), doors="closed"), 1.5, 5.98) == 100
+    assert {d["what"]: d["count"] for d in notes.dropped} == {
+        "objects door": 1,
+        "objects measurement": 1,
+        "objects fiducial": 1,
+    }
+
+
+def test_a_fence_says_how_far_the_site_reaches() -> None:
+    fence = shapely.Polygon([(0, 0), (10, 0), (0, 10)])
+    rows = (shapely.box(1, 1, 2, 2), {"kind": "building"})
+    g = grid(layers(objects(rows), fence=fence))
+    assert list(g.origin) == [0, 0, 0]
+    assert (g.width, g.height) == (200, 200)
+    assert (at(g, 1.5, 1.5), at(g, 3, 3), at(g, 9, 9)) == (100, 0, 255)
+    notes = Notes()
+    grid(layers(objects((shapely.box(50, 50, 51, 51), {"kind": "building"})), fence=fence), notes)
+    assert "outside the fence" in notes.warnings[0].problem
+    floor = (shapely.box(0, 0, 3, 3), {"kind": "floor"})
+    g = grid(layers(objects(rows, floor), fence=fence))
+    assert (at(g, 2.5, 2.5), at(g, 4, 4)) == (0, 255), "within the fence only floors are free"
+
+
+def test_a_fence_on_earth_without_a_datum_is_told_and_left() -> None:
+    notes = Notes()
+    content = layers(
+        objects((shapely.box(1, 1, 2, 2), {"kind": "wall"})), fence=shapely.box(9, 51, 10, 52), anchor="wgs84"
+    )
+    assert grid(content, notes).width == 60
+    assert "the fence is not used" in notes.warnings[0].problem
+
+
+def test_places_on_earth_need_a_datum() -> None:
+    house = shapely.box(10.001, 52.001, 10.0012, 52.0011)
+    part = objects((house, {"kind": "building"}), anchor="wgs84")
+    with pytest.raises(MissingDatum, match="no datum"):
+        grid(layers(part))
+    content = layers(part, datum=DATUM)
+    g = grid(content)
+    frame = content.frame
+    assert frame is not None
+    (local,) = frame.geometries_to_local(np.array([house], object))
+    assert occupied(g) == pytest.approx(local.area, rel=0.05)
+    assert at(g, local.centroid.x, local.centroid.y) == 100
+
+
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({"building": "yes"}, True),
+        ({"building": "yes", "building:levels": "3"}, True),
+        ({"building": "roof"}, False),
+        ({"building": "yes", "min_height": "2.5 m", "height": "4"}, False),
+        ({"building": "yes", "building:min_level": "1"}, False),
+        ({"building": "yes", "height": "10 cm"}, False),
+        ({"barrier": "fence"}, True),
+        ({"barrier": "gate"}, False),
+        ({"natural": "water"}, True),
+        ({"natural": "wood"}, False),
+        ({"waterway": "stream", "tunnel": "culvert"}, False),
+        ({"waterway": "stream"}, True),
+        ({"highway": "residential"}, False),
+        ({"highway": "street_lamp"}, True),
+        ({"power": "line"}, False),
+        ({"power": "tower"}, True),
+        ({"landuse": "forest"}, False),
+        ({"amenity": "parking"}, False),
+    ],
+)
+def test_the_tags_of_openstreetmap(tags: dict[str, str], expected: bool) -> None:
+    said = {"kind": next(iter(tags)), "osm": {"tags": tags}}
+    content = layers(objects((shapely.box(0, 0, 2, 2), said), (shapely.box(9, 9, 9.1, 9.1), {"kind": "post"})))
+    assert (at(grid(content), 1, 1) == 100) is expected
+
+
+def test_widths_and_discs_of_lines_and_points() -> None:
+    def square_metres(geometry: Any, **said: Any) -> float:
+        return occupied(grid(layers(objects((geometry, said))), resolution=0.01))
+
+    line = shapely.LineString([(0.003, 0.003), (10.003, 0.003)])
+    assert square_metres(line, kind="barrier", osm={"tags": {"barrier": "hedge", "width": "2"}}) == pytest.approx(
+        20, 0.02
+    )
+    assert square_metres(line, kind="waterway", osm={"tags": {"waterway": "river"}}) == pytest.approx(50, 0.02)
+    assert square_metres(line, kind="fence") == pytest.approx(1, 0.15)
+    tree = {"kind": "natural", "osm": {"tags": {"natural": "tree"}}}
+    assert square_metres(shapely.Point(3, 3), **tree) == pytest.approx(math.pi * 0.04, 0.15)
+    sized = square_metres(shapely.Point(3, 3), kind="crate", size=[1, 2, 1], pose=[3, 3, 0, 0, 0, 0.5])
+    assert sized == pytest.approx(2, 0.05)
+    assert square_metres(shapely.box(0, 0, 1, 1), kind="something", height=1.0) == pytest.approx(1, 0.05)
+
+
+def test_multipolygons_are_put_together_from_their_ways() -> None:
+    def way(i: int, *refs: tuple[float, float]) -> tuple[str, Any, dict[str, Any]]:
+        return f"w{i}", shapely.LineString(refs), {"kind": "line", "osm": {"tags": {}}}
+
+    tags = {"type": "multipolygon", "building": "yes"}
+    members = [["way", 1, "outer"], ["way", 2, "outer"], ["way", 3, "inner"], ["way", 9, "outer"]]
+    rows = [
+        way(1, (0, 0), (4, 0), (4, 4)),
+        way(2, (4, 4), (0, 4), (0, 0)),
+        way(3, (1, 1), (3, 1), (3, 3), (1, 3), (1, 1)),
+        ("r1", None, {"kind": "building", "osm": {"members": members, "tags": tags}}),
+    ]
+    content = Layers({PartKey("objects", "ground", "osm"): features(rows, "local")})
+    assert occupied(grid(content)) == pytest.approx(12)
+
+
+def test_resolution_inflation_and_padding() -> None:
+    content = layers(objects((shapely.box(0, 0, 1, 1), {"kind": "building"})))
+    g = grid(content, resolution=0.25, padding=2.0)
+    assert (g.resolution, g.width) == (0.25, 20)
+    grown = grid(content, inflate=0.5, resolution=0.02)
+    assert occupied(grown) == pytest.approx(1 + 4 * 0.5 + math.pi * 0.25, rel=0.02)
+
+
+def test_a_town_gets_coarser_cells_and_absurd_wishes_are_refused() -> None:
+    house = (shapely.box(0, 0, 10, 10), {"kind": "building"})
+    town = layers(objects(house, (shapely.box(3000, 3000, 3010, 3010), {"kind": "wall"})))
+    notes = Notes()
+    g = grid(town, notes)
+    assert g.resolution == 1.0
+    assert notes.template[0]["what"] == "resolution"
+    with pytest.raises(CannotConvert, match=r"the limit is 268435456 cells .* resolution of at least 0\.18"):
+        grid(town, resolution=0.01)
+    world = layers(objects(house, (shapely.box(9e6, 9e6, 9e6 + 1, 9e6 + 1), {"kind": "wall"})))
+    with pytest.raises(CannotConvert, match="ask for a resolution"):
+        grid(world)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [],
+        [(shapely.box(0, 0, 5, 5), {"kind": "region"})],
+        [(shapely.Point(0, 0), {"kind": "poi"}), (None, {})],
+        [(shapely.LineString([(0, 0), (1, 1)]), {"kind": "path", "height": 3.0})],
+        [(None, {"kind": "model", "shapes": [{"type": "plane", "size": [9, 9], "normal": [0, 0, 1]}]})],
+        [(None, {"kind": "model", "shapes": [{**BOX, "visual": True}]})],
+        [(None, {"kind": "light", "shapes": [BOX]})],
+        [(None, {"kind": "building"})],
+        [(None, {"kind": "model", "shapes": [{"type": "mesh", "file": "absent.dae"}]})],
+        [(None, {"kind": "model", "shapes": "nonsense"})],
+    ],
+)
+def test_nothing_in_the_way_is_a_clear_problem(rows: list[Any]) -> None:
+    with pytest.raises(MissingLayer, match="stands in a robot's way"):
+        grid(layers(objects(*rows)))
+
+
+def test_what_cannot_be_read_is_left_out_and_told() -> None:
+    mesh = {"type": "mesh", "file": "bad.stl"}
+    rows: list[Any] = [
+        (None, {"kind": "model", "shapes": [BOX]}),
+        (None, {"kind": "model", "shapes": [BOX, mesh]}),
+        (None, {"kind": "model", "shapes": [{"type": "mesh", "file": "flat.stl"}]}),
+    ]
+    notes = Notes()
+    flat = stl(((5, 5, 0), (5, 5, 0), (5, 5, 0)), ((6, 6, 0), (6, 6, 1), (7, 6, 0)))
+    g = grid(layers(objects(*rows), files={"bad.stl": b"", "flat.stl": flat}), notes)
+    assert at(g, 0, 0) == 100
+    assert 100 in (at(g, 6.5, 6.02), at(g, 6.5, 5.98)), "an open triangle is still a surface"
+    assert [(w.where, "bad.stl" in w.problem) for w in notes.warnings] == [("o1", True)]
+    assert notes.dropped == [{"what": "objects with solids", "count": 1, "why": "their solids cannot be read"}]
+
+
+def test_visuals_count_only_where_asked() -> None:
+    content = layers(objects((None, {"kind": "model", "shapes": [{**BOX, "visual": True}]})))
+    assert occupied(grid(content, visuals=True)) == pytest.approx(2)
+
+
+def test_parameters_are_checked() -> None:
+    chosen = parameters.parse(Parameters, {"band": "0.1,1.5", "doors": "closed"})
+    assert chosen.band == (0.1, 1.5)
+    for wrong in ({"height": "a"}, {"band": "1"}, {"resolution": "0"}, {"doors": "ajar"}, {"inflate": "-1"}):
+        with pytest.raises(Invalid):
+            parameters.parse(Parameters, wrong)
+    content = layers(objects((None, {"kind": "model", "shapes": [BOX]})))
+    with pytest.raises(Invalid, match="exclude each other"):
+        grid(content, height=1.0, band=(0.0, 1.0))
+    with pytest.raises(Invalid, match="low height comes first"):
+        grid(content, band=(1.0, 0.0))
+
+
+def test_it_is_planned_with_what_it_may_also_read() -> None:
+    plan = derive.plan(frozenset({"objects"}), frozenset({"occupancy"}))
+    assert plan is not None
+    assert [s.name for s in plan.steps] == ["objects_to_occupancy"]
+    assert plan.steps[0].reads == {"objects", "resources", "location"}
+
+
+# --- real maps -------------------------------------------------------------------------------------------------------
+
+
+def read(*paths: Path) -> Layers:
+    files = {p.name: p.read_bytes() for p in paths}
+    told = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits())
+    return told.layers(None)
+
+
+@pytest.mark.parametrize(
+    ("name", "level", "walls", "floor"),
+    [
+        # metres of walls, square metres of floors: by hand from the file's pixels and its measurements
+        ("office/office.building.yaml", "L1", 33, 4),
+        ("hotel/hotel.building.yaml", "L1", 56, 3),
+        ("hotel/hotel.building.yaml", "L3", None, None),
+        ("robast_sim/tiplu.building.yaml", "Tiplu", 21, 1),
+    ],
+)
+def test_a_real_building_is_its_walls_and_floors(
+    shared: Path, name: str, level: str, walls: int | None, floor: int | None
+) -> None:
+    """Against shapely on the file's own numbers, read with a plain YAML loader."""
+    import yaml
+
+    path = shared / "data/openrmf_building" / name
+    said = yaml.safe_load(path.read_text())["levels"]
+    content = read(path)
+    g = grid(content, level=level)
+    if walls is None:
+        assert g.counts()["free"] > 100_000
+        return
+    one = said[level]
+    assert (len(one["walls"]), len(one["floors"])) == (walls, floor)
+    xy = np.array([[v[0], -v[1]] for v in one["vertices"]])
+    scale = np.mean([m[2]["distance"][1] / np.hypot(*(xy[m[0]] - xy[m[1]])) for m in one["measurements"]])
+    xy *= scale
+    lines = shapely.union_all([shapely.LineString(xy[w[:2]]) for w in one["walls"]])
+    floors = shapely.union_all([shapely.Polygon(xy[f["vertices"]]) for f in one["floors"]])
+    x, y = np.meshgrid(
+        g.origin[0] + (np.arange(g.width) + 0.5) * g.resolution,
+        g.origin[1] + (np.arange(g.height) + 0.5) * g.resolution,
+    )
+    middles = shapely.points(x, y)
+    away = shapely.distance(middles, lines)
+    assert (g.cells[away < 0.049] == 100).all()
+    assert (g.cells[away > 0.05 * math.sqrt(2) + 0.036 + 0.001] != 100).all()
+    inside = shapely.contains(floors, middles)
+    assert (g.cells[inside & (g.cells != 100)] == 0).all()
+    assert (g.cells[~inside & (g.cells != 100)] == 255).all()
+
+
+def test_the_walls_of_robast_sim_are_on_its_ros_map(shared: Path) -> None:
+    """The building was drawn by hand over the picture of the ROS map, so pixels are cells."""
+    import yaml
+    from scipy import ndimage  # type: ignore[import-untyped]
+
+    folder = shared / "data/openrmf_building/robast_sim"
+    derived = grid(read(folder / "tiplu.building.yaml"), level="Tiplu")
+    real = read(*(p for p in (folder / "ros_map").iterdir() if p.suffix in (".yaml", ".pgm")))
+    (measured,) = real.grids().values()
+    said = yaml.safe_load((folder / "tiplu.building.yaml").read_text())["levels"]["Tiplu"]
+    (a, b, more) = said["measurements"][0][:3]
+    ends = np.array([said["vertices"][k][:2] for k in (a, b)])
+    scale = more["distance"][1] / np.hypot(*(ends[0] - ends[1]))
+    assert scale == pytest.approx(measured.resolution, rel=0.03)
+    rows, columns = np.nonzero(derived.cells == 100)
+    x = (derived.origin[0] + (columns + 0.5) * derived.resolution) / scale
+    y = measured.height + (derived.origin[1] + (rows + 0.5) * derived.resolution) / scale
+    away = ndimage.distance_transform_edt(measured.cells != 100) * measured.resolution
+    here = away[np.clip(y.astype(int), 0, measured.height - 1), np.clip(x.astype(int), 0, measured.width - 1)]
+    assert (here <= 0.2).mean() > 0.8
+    assert (here <= 0.5).mean() > 0.95

@@ -1,0 +1,203 @@
+"""The rasteriser against shapely and trimesh, cell by cell, and against truths worked out by hand."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from app.derive import _raster
+from app.derive._raster import Frame, Spans
+from app.errors import CannotConvert
+from app.model import solids
+
+FRAME = Frame((-1.0, -2.0), 0.25, 20, 24)
+
+
+def cells(spans: Iterable[Spans], frame: Frame = FRAME, layers: int = 1) -> Any:
+    """bool [layers, height, width]."""
+    out = np.zeros((layers, frame.height, frame.width), bool)
+    for part in spans:
+        layer, row, column = _raster.expanded(part)
+        out[layer, row, column] = True
+    return out
+
+
+def boxes(frame: Frame = FRAME) -> Any:
+    x, y = np.meshgrid(np.arange(frame.width), np.arange(frame.height))
+    low_x, low_y = frame.origin[0] + x * frame.resolution, frame.origin[1] + y * frame.resolution
+    return shapely.box(low_x, low_y, low_x + frame.resolution, low_y + frame.resolution)
+
+
+def shape(**said: Any) -> Any:
+    return solids.triangles({"shapes": [said]}, {})
+
+
+def clipped(triangle: Any, low: float, high: float) -> Any:
+    """A triangle between two heights seen from above, by an independent way: half planes on a finely known polygon."""
+    out = [tuple(p) for p in triangle]
+    for sign, bound in ((1.0, low - 1e-9), (-1.0, -high - 1e-9)):
+        kept = []
+        for a, b in zip(out, [*out[1:], *out[:1]], strict=True):
+            da, db = sign * a[2] - bound, sign * b[2] - bound
+            if da >= 0:
+                kept.append(a)
+            if (da >= 0) != (db >= 0):
+                t = da / (da - db)
+                kept.append(tuple(p + (q - p) * t for p, q in zip(a, b, strict=True)))
+        out = kept
+    return shapely.convex_hull(shapely.MultiPoint([p[:2] for p in out])) if out else shapely.Polygon()
+
+
+@given(st.integers(0, 2**32 - 1), st.booleans())
+@settings(max_examples=30, deadline=None)
+def test_a_surface_touches_the_cells_that_it_meets(seed: int, slice_: bool) -> None:
+    random = np.random.default_rng(seed)
+    triangles = random.uniform([-2, -3, 0], [5, 5, 2], (4, 3, 3))
+    low = float(random.uniform(0, 2))
+    high = low if slice_ else float(random.uniform(low, 2.2))
+    made = cells(_raster.surfaces(triangles, FRAME, np.array([[low, high]])))[0]
+    pieces = [clipped(t, low, high) for t in triangles]
+    # A micrometre against the normal moves the cut of a nearly level triangle by more: only what is grazed may differ.
+    near = np.logical_or.reduce([shapely.distance(boxes(), p) < 1e-3 for p in pieces])
+    sure = np.logical_or.reduce([shapely.intersects(shapely.buffer(boxes(), -1e-3), p) for p in pieces])
+    assert not (made & ~near).any()
+    assert not (sure & ~made).any()
+
+
+def test_slabs_are_layers() -> None:
+    random = np.random.default_rng(4)
+    triangles = random.uniform([-2, -3, 0], [5, 5, 2], (30, 3, 3))
+    heights = np.arange(9) * 0.25
+    slabs = np.column_stack([heights[:-1], heights[1:]])
+    together = cells(_raster.surfaces(triangles, FRAME, slabs), layers=8)
+    for k, slab in enumerate(slabs):
+        alone = cells(_raster.surfaces(triangles, FRAME, slab[None]))[0]
+        assert (together[k] == alone).all()
+
+
+def test_a_box_covers_its_cells_and_no_more() -> None:
+    box = shape(type="box", size=[1.0, 0.5, 1.0], pose=[0.5, 0.25, 0.5, 0, 0, 0])
+    for low, high in ((0.2, 0.2), (0.0, 1.0), (-5.0, 5.0), (0.0, 0.0)):
+        made = cells(_raster.surfaces(box, FRAME, np.array([[low, high]])))[0]
+        made |= cells(_raster.insides(box, np.zeros(len(box), int), FRAME, np.array([low])))[0]
+        rows, columns = np.nonzero(made)
+        assert (rows.min(), rows.max(), columns.min(), columns.max()) == (8, 9, 4, 7)
+        assert made.sum() == 8
+    for height in (1.0, -0.1):
+        slab = np.array([[height, height]])
+        assert not cells(_raster.surfaces(box, FRAME, slab)).any(), "the top is where it ends"
+        assert not cells(_raster.insides(box, np.zeros(len(box), int), FRAME, slab[:, 0])).any()
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_inside_agrees_with_the_distance_to_spheres(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    at = random.uniform([-1, -2, 0], [4, 4, 1], (5, 3))
+    radii = random.uniform(0.1, 1.5, 5)
+    parts = [shape(type="sphere", radius=float(r), pose=[*map(float, p)]) for p, r in zip(at, radii, strict=True)]
+    parts[0] = parts[0][:, ::-1]  # its inside turned out
+    owner = np.repeat(np.arange(5), [len(p) for p in parts])
+    height = 0.5 + 1e-4
+    made = cells(_raster.insides(np.concatenate(parts), owner, FRAME, np.array([height])))[0]
+    x, y = np.meshgrid(np.arange(20) * 0.25 - 0.875, np.arange(24) * 0.25 - 1.875)
+    away = np.min(
+        [np.hypot(np.hypot(x - p[0], y - p[1]), height - p[2]) - r for p, r in zip(at, radii, strict=True)], axis=0
+    )
+    assert made[away < -0.01].all()
+    assert not made[away > 1e-6].any()
+
+
+def test_an_open_surface_encloses_nothing() -> None:
+    box = shape(type="box", size=[2, 2, 2])
+    walls = box[np.ptp(box[:, :, 2], axis=1) > 0]
+    none = np.zeros(len(box), int)
+    at = np.array([0.0])
+    assert cells(_raster.insides(walls, none[: len(walls)], FRAME, at)).sum() == 64, "a tube is closed at every height"
+    gap = walls[1:]
+    assert cells(_raster.insides(gap, none[: len(gap)], FRAME, at)).sum() in (0, 32), "rows that are open are left"
+    both = np.concatenate([gap, shape(type="box", size=[0.5, 0.5, 2], pose=[2, 2, 0])])
+    owner = np.append(np.zeros(len(gap), int), np.ones(12, int))
+    assert cells(_raster.insides(both, owner, FRAME, at))[0, 15:18, 11:14].sum() == 4, "others are judged on their own"
+
+
+def test_areas_with_holes_agree_with_rasterio() -> None:
+    from rasterio.features import rasterize  # type: ignore[import-untyped]
+    from rasterio.transform import Affine  # type: ignore[import-untyped]
+
+    random = np.random.default_rng(3)
+    for _ in range(10):
+        outer = shapely.Point(*random.uniform(0, 2, 2)).buffer(float(random.uniform(0.5, 2)), quad_segs=3)
+        hole = shapely.affinity.scale(outer, 0.5, 0.4)
+        area = shapely.MultiPolygon([shapely.Polygon(outer.exterior, [hole.exterior]), shapely.box(3.1, 3.1, 3.6, 3.7)])
+        made = cells(_raster.areas([area], FRAME, touched=False))[0]
+        transform = Affine(0.25, 0, -1, 0, -0.25, -2 + 24 * 0.25)
+        theirs = rasterize([area], (24, 20), transform=transform)[::-1].astype(bool)
+        assert (made == theirs).all()
+        touched = cells(_raster.areas([area], FRAME, touched=True))[0]
+        assert (touched == shapely.intersects(boxes(), area)).all()
+
+
+def test_lines_and_points_and_what_lies_outside() -> None:
+    line = shapely.LineString([(-0.9, -1.9), (0.9, -1.9), (0.9, 100)])
+    made = cells(_raster.areas([line], FRAME, touched=False))[0]
+    assert np.flatnonzero(made[0]).tolist() == list(range(8))
+    assert np.flatnonzero(made[:, 7]).tolist() == list(range(24))
+    assert made.sum() == 31
+    assert cells(_raster.areas([shapely.Point(0.1, 0.1)], FRAME, touched=False))[0, 8, 4]
+    far = [shapely.Point(50, 50), shapely.box(90, 90, 99, 99), shapely.LineString([(-9, 0), (-8, 0)]), shapely.Point()]
+    assert not cells(_raster.areas(far, FRAME, touched=True)).any()
+    assert cells(_raster.areas([shapely.box(-99, -99, 99, 99)], FRAME, touched=True)).all()
+    assert not list(_raster.areas([], FRAME, touched=True))
+
+
+def test_frames_lie_on_whole_cells() -> None:
+    frame = Frame.around((0.3, -0.31, 0.9, 0.6), 0.1)
+    assert (frame.origin, frame.width, frame.height) == ((0.3, -0.4), 6, 10)
+    assert Frame.around((1.0, 1.0, 1.0, 1.0), 0.5).cells == 1
+    assert _raster.limited(frame, 60, 10) is frame
+    for most, longest in ((59, 100), (1000, 9)):
+        with pytest.raises(CannotConvert, match="resolution of at least"):
+            _raster.limited(frame, most, longest)
+
+
+def test_paint_and_grow() -> None:
+    grid = np.zeros((24, 20), np.uint8)
+    _raster.paint(grid, [np.array([[0, 5, 3, 4], [7, 5, 3, 6], [0, 23, 19, 20]])], 100)
+    assert np.argwhere(grid).tolist() == [[5, 3], [5, 4], [5, 5], [23, 19]]
+    _raster.grown(grid, 100, 2.0)
+    away = np.hypot(*np.meshgrid(np.arange(20) - 19, np.arange(24) - 23))
+    y, x = np.mgrid[:24, :20]
+    near = np.min([np.hypot(x - c, y - 5) for c in (3, 4, 5)], axis=0)
+    assert ((grid == 100) == ((near <= 2) | (away <= 2))).all()
+    _raster.grown(grid, 50, 3.0)
+    assert set(np.unique(grid)) == {0, 100}, "nothing has that value"
+
+
+def test_growing_in_strips_is_growing(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(0)
+    wide = np.where(random.random((900, 20_000)) < 1e-5, 100, 0).astype(np.uint8)
+    narrow = wide.copy()
+    _raster.grown(wide, 100, 30.0)  # 2^24 cells are less than its rows
+    _raster.grown(narrow[:, :9000], 100, 30.0)
+    assert (wide[:, :8960] == narrow[:, :8960]).all()
+    assert wide.any()
+
+
+def test_many_triangles_are_quick() -> None:
+    random = np.random.default_rng(2)
+    middle = random.uniform([0, 0, 0], [100, 100, 2], (300_000, 1, 3))
+    triangles = middle + random.normal(0, 0.1, (300_000, 3, 3))
+    frame = Frame((0.0, 0.0), 0.05, 2000, 2000)
+    grid = np.zeros((2000, 2000), np.uint8)
+    start = time.perf_counter()
+    _raster.paint(grid, _raster.surfaces(triangles, frame, np.array([[0.2, 1.0]])), 100)
+    assert grid.any()
+    assert time.perf_counter() - start < 10
