@@ -101,6 +101,35 @@ class Settings(BaseSettings):
         default=20, ge=1, le=10_000, description="Wrong tokens a minute from one address before it is answered 429."
     )
 
+    zenoh_mode: Literal["router", "client", "off"] = Field(
+        default="router",
+        description="How events reach the fleet: `router` starts a Zenoh router beside the server, `client` uses the "
+        "one at `FLEETMAP_ZENOH_CONNECT`, `off` sends none (robots poll).",
+    )
+    zenoh_listen: str = Field(
+        default="tcp/127.0.0.1:7447",
+        description="Where the router listens, separated by commas. A taken port means no events, told loudly and in "
+        "`/readyz`.",
+    )
+    zenoh_connect: str = Field(
+        default="",
+        description="Routers to connect to, separated by commas (`tcp/router:7447`): needed as `client`; as `router` "
+        "its own router joins them.",
+    )
+    zenoh_prefix: str = Field(
+        default="fleetmap",
+        pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$",
+        description="Start of every key expression.",
+    )
+    zenoh_config: Path | None = Field(
+        default=None,
+        description="A JSON5 file of Zenoh's own configuration: TLS, users, access control. Where to listen and "
+        "connect stands in the settings above.",
+    )
+    zenoh_max_reply_bytes: int = Field(
+        default=64 * 2**20, ge=1024, description="Largest file that is answered over Zenoh; HTTP has no such bound."
+    )
+
     max_upload_bytes: int = Field(
         default=_DEFAULTS.upload_bytes, ge=1, description="Largest upload: the sum of all files of one request."
     )
@@ -137,7 +166,7 @@ class Settings(BaseSettings):
     )
     max_warnings: int = Field(default=_DEFAULTS.warnings, ge=1, description="Most warnings kept with one version.")
 
-    @field_validator("database_url", "blob_url", "admin_token", mode="before")
+    @field_validator("database_url", "blob_url", "admin_token", "zenoh_config", mode="before")
     @classmethod
     def _empty_is_unset(cls, value: Any) -> Any:
         return None if value == "" else value
@@ -156,6 +185,12 @@ class Settings(BaseSettings):
                 f"insecure_no_auth works only while listening on a loopback address, not on {self.host}: "
                 "listen on 127.0.0.1, or leave it out and use tokens"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _client_needs_a_router(self) -> Self:
+        if self.zenoh_mode == "client" and not self.zenoh_connect.strip():
+            raise ValueError("zenoh_mode client needs zenoh_connect: where the router is, like tcp/router:7447")
         return self
 
     @property

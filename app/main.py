@@ -11,6 +11,7 @@ import shutil
 import sys
 from collections.abc import AsyncIterator, Iterator
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from app.api import (
     derivations,
     diff,
     environments,
+    events,
     formats,
     health,
     jobs,
@@ -51,6 +53,8 @@ from app.api.uploads import Intake
 from app.config import Settings
 from app.convert import Maps
 from app.errors import FleetMapError, Unavailable
+from app.events.bus import Bus, BusOptions
+from app.events.relay import Relay
 from app.ingest import Ingest
 from app.pool import Pool
 from app.sandbox import Allowed
@@ -75,6 +79,8 @@ def create_app(settings: Settings) -> Server:
     async def lifespan(app: Server) -> AsyncIterator[None]:
         here = await run_in_threadpool(open_services, settings)
         app.state.services = here
+        app.state.feed = events.Feed(here)
+        relay = relay_of(settings, here)
         app.hot = here.hot
         ticker = asyncio.create_task(_tick(here))
         try:
@@ -84,6 +90,8 @@ def create_app(settings: Settings) -> Server:
             ticker.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await ticker
+            if relay is not None:
+                await run_in_threadpool(relay.close)
             await run_in_threadpool(close_services, here)
 
     app = Server(
@@ -113,6 +121,7 @@ def create_app(settings: Settings) -> Server:
         formats,
         derivations,
         convert,
+        events,
         jobs,
         tokens,
     ):
@@ -227,6 +236,8 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
             max_json_bytes=settings.max_json_bytes,
             body_seconds=settings.body_seconds,
             insecure_no_auth=settings.insecure_no_auth,
+            data_dir=settings.data_dir,
+            zenoh_mode=settings.zenoh_mode,
         ),
         store=store,
         pool=pool,
@@ -238,6 +249,31 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         intake=intake,
         metrics=metrics,
     )
+
+
+def relay_of(settings: Settings, here: Services) -> Relay | None:
+    """Events to the fleet, begun; None where they are off."""
+    if settings.zenoh_mode == "off":
+        return None
+    options = BusOptions(
+        mode=settings.zenoh_mode,
+        listen=settings.zenoh_listen,
+        connect=settings.zenoh_connect,
+        prefix=settings.zenoh_prefix,
+        config=settings.zenoh_config,
+        max_reply_bytes=settings.zenoh_max_reply_bytes,
+    )
+
+    def status(environment: str, robot: str, payload: bytes) -> None:
+        log.debug("status of %s in %s: %d bytes", robot, environment, len(payload))
+
+    def alive(robot: str, there: bool) -> None:
+        log.debug("%s is %s", robot, "there" if there else "gone")
+
+    bus = Bus(options, ask=partial(events.ask, here), on_status=status, on_alive=alive)
+    relay = Relay(here.store, bus, settings.data_dir)
+    relay.start()
+    return relay
 
 
 def close_services(here: Services) -> None:

@@ -14,6 +14,7 @@ from app.api.metrics import CONTENT_TYPE
 from app.api.schemas import told
 from app.api.services import Here, Services
 from app.errors import Unavailable
+from app.events.relay import state_of
 
 READY_SECONDS = 5.0
 
@@ -28,14 +29,18 @@ async def healthz() -> Response:
 
 @router.get("/readyz", responses=told(None, 503), summary="Ready")
 async def readyz(request: Request) -> Response:
-    """Whether database and file store answer and the schema is this release's."""
+    """Whether database and file store answer and the schema is this release's.
+
+    It also tells whether events go out over Zenoh; where they do not, maps are served all the same.
+    """
     here: Services = request.app.state.services
     try:
         async with asyncio.timeout(READY_SECONDS):
             await run_in_threadpool(here.store.check)
     except TimeoutError:
         raise Unavailable(f"database or file store did not answer within {READY_SECONDS:g} seconds") from None
-    return answer({"status": "ready", "database": "ok", "blobs": "ok"})
+    events = state_of(here.options.data_dir, here.options.zenoh_mode)
+    return answer({"status": "ready", "database": "ok", "blobs": "ok", "events": events})
 
 
 @router.get(

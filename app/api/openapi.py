@@ -113,6 +113,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("layers", "Canonical content."),
             ("maps", "Maps in a format, converted on demand."),
             ("channels", "Which version robots drive on."),
+            ("events", "Every change as it happens."),
             ("transform", "Between earth and local frame."),
             ("derivations", "What is computed from what, and committing it."),
             ("formats", "What can be read, served and converted."),

@@ -31,6 +31,8 @@ class ApiOptions:
     max_json_bytes: int = 64 * 2**20
     body_seconds: float = 30.0
     insecure_no_auth: bool = False
+    data_dir: Path = Path("data")
+    zenoh_mode: str = "off"
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,13 +99,14 @@ class Database:
             yield connection
 
     @contextmanager
-    def write(self) -> Iterator[Connection]:
-        """A transaction that writes: all or nothing, and on disk when it ends."""
+    def write(self, *, tell: bool = True) -> Iterator[Connection]:
+        """A transaction that writes: all or nothing, and on disk when it ends. tell: whether caches are to know."""
         with translated(), self.engine.connect() as connection:
             connection.execution_options(write=True)
             with connection.begin():
                 yield connection
-        self._written()
+        if tell:
+            self._written()
 
     def close(self) -> None:
         """Give back all connections."""

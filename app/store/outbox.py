@@ -6,11 +6,14 @@ from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any, Literal
 
-from sqlalchemy import Connection, insert, select, update
+from sqlalchemy import Connection, func, insert, select, update
 
 from app.store import tables
 from app.store.base import Base, environment_row
 from app.store.values import Event, PartEntry, rfc3339
+
+REACH = 100_000
+"""So far back in the log the last events of environments are looked for."""
 
 EventType = Literal["version.created", "channel.planned", "channel.moved", "environment.created", "environment.deleted"]
 
@@ -95,6 +98,46 @@ class Outbox(Base):
                     table.c.sequence
                 )
             rows = connection.execute(query.limit(limit)).all()
+        return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in rows]
+
+    def last_sequence(self, environment: str) -> int:
+        """The sequence of an environment's newest event."""
+        with self._database.read() as connection:
+            return int(environment_row(connection, environment, deleted=True).sequence)
+
+    def relayed(self) -> int:
+        """The position up to which events were handed to the bus."""
+        with self._database.read() as connection:
+            found = connection.execute(select(tables.relay.c.position).where(tables.relay.c.id == 1)).scalar()
+        return int(found or 0)
+
+    def set_relayed(self, position: int) -> None:
+        """Note that events up to this position were handed over. It never goes back."""
+        table = tables.relay
+        with self._database.write(tell=False) as connection:
+            known = connection.execute(select(table.c.position).where(table.c.id == 1)).scalar()
+            if known is None:
+                connection.execute(insert(table).values(id=1, position=position))
+            elif known < position:
+                connection.execute(update(table).where(table.c.id == 1).values(position=position))
+
+    def last_events(self, position: int, each: int, environments: int) -> list[Event]:
+        """The last ``each`` events up to a position of the environments changed last, in the order of the log."""
+        table, owner = tables.event, tables.environment
+        newest = select(owner.c.id).order_by(owner.c.updated.desc(), owner.c.id).limit(environments)
+        rank = func.row_number().over(partition_by=table.c.environment_id, order_by=table.c.sequence.desc())
+        recent = (
+            select(table, rank.label("rank"))
+            .where(
+                table.c.position <= position,
+                table.c.position > position - REACH,
+                table.c.environment_id.in_(newest.scalar_subquery()),
+            )
+            .subquery()
+        )
+        query = select(recent).where(recent.c.rank <= each).order_by(recent.c.position)
+        with self._database.read() as connection:
+            rows = connection.execute(query).all()
         return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in rows]
 
     def last_position(self) -> int:

@@ -261,6 +261,14 @@ log = Table(
 )
 """One row: the position of the newest event. Its lock puts the events of all environments in one order."""
 
+relay = Table(
+    "relay",
+    metadata,
+    Column("id", Integer, primary_key=True, autoincrement=False),
+    Column("position", BigInteger, nullable=False),
+)
+"""One row: the position up to which events were handed to the bus."""
+
 retired = Table(
     "retired",
     metadata,

@@ -128,6 +128,7 @@ def running(settings: Settings) -> Iterator[Api]:
 def settings_for(folder: Path, **more: Any) -> Settings:
     """Settings that read nothing of the environment of whoever runs the tests."""
     values = {"admin_token": ADMIN, "conversion_workers": 1, "max_memory_bytes": 4 * 2**30, "log_level": "warning"}
+    values["zenoh_mode"] = "off"  # tests of events say where their router listens
     return Settings(_env_file=None, data_dir=folder, **{**values, **more})  # type: ignore[call-arg]
 
 

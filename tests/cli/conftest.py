@@ -49,7 +49,13 @@ class ServerProcess:
         clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
         self.process = subprocess.Popen(
             [sys.executable, "-m", "app.cli", "serve", "--port", "0", *arguments],
-            env={**clean, **environment, "PYTHONUNBUFFERED": "1", "PYTHONPATH": str(Path(__file__).parents[2])},
+            env={
+                **clean,
+                "FLEETMAP_ZENOH_MODE": "off",
+                **environment,
+                "PYTHONUNBUFFERED": "1",
+                "PYTHONPATH": str(Path(__file__).parents[2]),
+            },
             cwd=folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,

@@ -1,0 +1,349 @@
+"""The server's Zenoh session: publishers of events, queryables of maps, and what robots say of themselves.
+
+Zenoh calls back in threads of its own; callbacks here only hand over to a small pool of threads. Source of the choices:
+an AdvancedPublisher with cache and sporadic heartbeat over DROP loses nothing when a router is away for a while, where
+plain publishers lose everything of that time, and BLOCK lets one stopped subscriber stall all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import zenoh
+from zenoh import ext
+
+from app.errors import FleetMapError, Unavailable
+from app.events import messages
+from app.events.router import Router
+
+log = logging.getLogger(__name__)
+
+HISTORY = 64
+"""Events of each environment that late joiners get, and that outlast a router's absence."""
+
+PUBLISHERS = 4096
+"""Environments with a publisher; the ones that were silent longest give way."""
+
+HEARTBEAT_SECONDS = 0.3
+THREADS = 4
+WAITING = 256
+"""Queries that may wait; further ones are told so."""
+
+CONNECT_SECONDS = 10.0
+
+Mode = Literal["router", "client", "off"]
+
+
+@dataclass(frozen=True, slots=True)
+class BusOptions:
+    """How to reach the fleet. config: a JSON5 file of Zenoh's own for TLS, users and access control."""
+
+    mode: Mode = "router"
+    listen: str = "tcp/127.0.0.1:7447"
+    connect: str = ""
+    prefix: str = messages.PREFIX
+    config: Path | None = None
+    max_reply_bytes: int = 64 * 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a query is answered with."""
+
+    payload: bytes
+    encoding: str
+
+
+Ask = Callable[[str, str, Mapping[str, str]], Answer]
+"""(environment, the key after it, parameters) -> answer. Raises FleetMapError."""
+
+OnStatus = Callable[[str, str, bytes], None]
+"""(environment, robot, payload)."""
+
+OnAlive = Callable[[str, bool], None]
+"""(robot, whether its session is there)."""
+
+
+def router_configuration(options: BusOptions) -> str:
+    """The router's configuration: the operator's file, and what this server decides."""
+    config = _base(options)
+    _set(config, "mode", "router")
+    _set(config, "listen/endpoints", [part.strip() for part in options.listen.split(",")])
+    _set(config, "connect/endpoints", [part.strip() for part in options.connect.split(",") if part.strip()])
+    _set(config, "scouting/multicast/enabled", False)
+    _set(config, "transport/shared_memory/enabled", False)
+    _set(config, "transport/unicast/max_sessions", 10_000)
+    return str(config)
+
+
+def session_configuration(options: BusOptions) -> str:
+    """The configuration of the server's own session: a client of its router, or of the operator's."""
+    config = _base(options)
+    where = options.connect if options.mode == "client" else reachable(options.listen)
+    _set(config, "mode", "client")
+    _set(config, "connect/endpoints", [part.strip() for part in where.split(",") if part.strip()])
+    _set(config, "connect/timeout_ms", int(CONNECT_SECONDS * 1000))
+    _set(config, "connect/exit_on_failure", True)
+    _set(config, "listen/endpoints", [])
+    _set(config, "scouting/multicast/enabled", False)
+    _set(config, "transport/shared_memory/enabled", False)
+    with contextlib.suppress(zenoh.ZError):
+        _set(config, "access_control/enabled", False)  # the router's business
+        _set(config, "transport/auth/usrpwd/dictionary_file", None)
+    return str(config)
+
+
+def reachable(listen: str) -> str:
+    """Where a client on this machine finds a router that listens there."""
+    first = listen.split(",", maxsplit=1)[0].strip()
+    return first.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
+def _base(options: BusOptions) -> zenoh.Config:
+    if options.config is None:
+        return zenoh.Config()
+    try:
+        return zenoh.Config.from_file(str(options.config))
+    except Exception as error:
+        raise Unavailable(f"FLEETMAP_ZENOH_CONFIG: {options.config} cannot be read: {error}") from error
+
+
+def _set(config: zenoh.Config, key: str, value: Any) -> None:
+    config.insert_json5(key, json.dumps(value))
+
+
+class Bus:
+    """One session, opened again where it breaks. All methods are thread-safe."""
+
+    def __init__(self, options: BusOptions, *, ask: Ask, on_status: OnStatus, on_alive: OnAlive) -> None:
+        self.options = options
+        self._ask, self._on_status, self._on_alive = ask, on_status, on_alive
+        self._session: zenoh.Session | None = None
+        self._router: Router | None = None
+        self._held: list[Any] = []
+        self._publishers: OrderedDict[str, ext.AdvancedPublisher] = OrderedDict()
+        self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="fleetmap-zenoh")
+        self._waiting = threading.Semaphore(WAITING)
+        self._lock = threading.RLock()
+        self._problem = "not connected yet"
+        self.opened = 0
+
+    @property
+    def state(self) -> dict[str, str]:
+        """``{state: connected | down, detail?}`` for /readyz."""
+        if self.connected:
+            return {"state": "connected"}
+        return {"state": "down", "detail": self._problem}
+
+    @property
+    def connected(self) -> bool:
+        """Whether a router is there at this moment."""
+        session = self._session
+        try:
+            return session is not None and bool(session.info.routers_zid())
+        except zenoh.ZError:
+            return False
+
+    def open(self) -> bool:
+        """Start the router where it is ours and not there, connect, and declare everything. False where it fails."""
+        with self._lock:
+            if self.options.mode == "router" and (self._router is None or not self._router.alive):
+                if self._router is not None:
+                    self._router.close()
+                    self._router = None
+                router = Router(router_configuration(self.options))
+                if router.problem is not None:
+                    self._problem = f"the router cannot listen on {self.options.listen}: {router.problem}"
+                    return False
+                self._router = router
+            if self._session is not None:
+                return self.connected
+            try:
+                self._session = zenoh.open(zenoh.Config.from_json5(session_configuration(self.options)))
+                self._declare(self._session)
+            except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
+                self._problem = f"no router at {self._where}: {str(error).splitlines()[0][:300]}"
+                self._close_session()
+                return False
+            self.opened += 1
+            return True
+
+    def tend(self) -> bool:
+        """Look after it: a dead router of ours is started again; the session finds it by itself."""
+        router = self._router
+        if self._session is None or (router is not None and not router.alive):
+            return self.open() and self.connected
+        return self.connected
+
+    def publish(self, environment: str, body: Mapping[str, Any]) -> None:
+        """Put an event. It stays in the publisher's cache for who joins late or missed it."""
+        with self._lock:
+            if self._session is None:
+                raise Unavailable(self._problem)
+            publisher = self._publishers.get(environment)
+            if publisher is None:
+                publisher = self._declare_publisher(self._session, environment)
+                self._publishers[environment] = publisher
+                while len(self._publishers) > PUBLISHERS:
+                    _, old = self._publishers.popitem(last=False)
+                    _end(old)
+            self._publishers.move_to_end(environment)
+            publisher.put(messages.dumps(body), encoding=messages.JSON)
+
+    def close(self) -> None:
+        """Undeclare, close the session, end the router."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        with self._lock:
+            self._close_session()
+            if self._router is not None:
+                self._router.close()
+                self._router = None
+
+    @property
+    def _where(self) -> str:
+        return self.options.connect if self.options.mode == "client" else self.options.listen
+
+    def _declare_publisher(self, session: zenoh.Session, environment: str) -> ext.AdvancedPublisher:
+        return ext.declare_advanced_publisher(
+            session,
+            messages.events_key(self.options.prefix, environment),
+            cache=ext.CacheConfig(HISTORY),
+            publisher_detection=True,
+            sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_SECONDS),
+            reliability=zenoh.Reliability.RELIABLE,
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=True,
+        )
+
+    def _declare(self, session: zenoh.Session) -> None:
+        prefix = self.options.prefix
+        self._held = [
+            session.liveliness().declare_token(messages.server_key(prefix)),
+            session.declare_subscriber(f"{prefix}/*/robots/*/status", self._status),
+            session.liveliness().declare_subscriber(f"{prefix}/robots/*", self._alive, history=True),
+            session.declare_queryable(f"{prefix}/*/*/maps/**", self._query, complete=True),
+            session.declare_queryable(f"{prefix}/*/*/version", self._query, complete=True),
+        ]
+
+    def _close_session(self) -> None:
+        for publisher in self._publishers.values():
+            with contextlib.suppress(Exception):
+                _end(publisher)
+        self._publishers.clear()
+        for held in self._held:
+            with contextlib.suppress(Exception):
+                _end(held)
+        self._held = []
+        if self._session is not None:
+            with contextlib.suppress(Exception):
+                _close(self._session)
+            self._session = None
+
+    # --- zenoh's threads: hand over, do nothing else ---
+
+    def _status(self, sample: zenoh.Sample) -> None:
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        pieces = str(sample.key_expr).removeprefix(self.options.prefix + "/").split("/")
+        payload = bytes(sample.payload) if len(sample.payload) <= messages.MAX_STATUS_BYTES else b""
+        self._hand_over(self._on_status, pieces[0], pieces[2], payload)
+
+    def _alive(self, sample: zenoh.Sample) -> None:
+        robot = str(sample.key_expr).rpartition("/")[2]
+        self._hand_over(self._on_alive, robot, sample.kind == zenoh.SampleKind.PUT)
+
+    def _query(self, query: zenoh.Query) -> None:
+        if not self._waiting.acquire(blocking=False):
+            self._refuse(query, Unavailable("too many queries wait: try again in a few seconds"))
+            return
+        try:
+            self._threads.submit(self._answer, query)
+        except RuntimeError:  # closing
+            self._waiting.release()
+            _drop(query)
+
+    def _hand_over(self, function: Callable[..., None], *arguments: Any) -> None:
+        def call() -> None:
+            try:
+                function(*arguments)
+            except FleetMapError as error:
+                log.warning("a message over Zenoh was left out: %s", error.detail)
+            except Exception:
+                log.exception("a message over Zenoh could not be taken")
+
+        with contextlib.suppress(RuntimeError):
+            self._threads.submit(call)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        try:
+            key = str(query.key_expr)
+            if "*" in key:
+                raise Unavailable("ask for one map at a time: a key without wildcards")
+            environment, _, rest = key.removeprefix(self.options.prefix + "/").partition("/")
+            parameters = _parameters(query)
+            answer = self._ask(environment, rest, parameters)
+            if len(answer.payload) > self.options.max_reply_bytes:
+                raise Unavailable(
+                    f"the map has {len(answer.payload)} bytes, more than is sent over Zenoh "
+                    f"({self.options.max_reply_bytes}): fetch it over HTTP"
+                )
+            query.reply(key, answer.payload, encoding=answer.encoding)
+        except FleetMapError as error:
+            self._refuse(query, error)
+        except Exception:
+            log.exception("a query over Zenoh failed")
+            self._refuse(query, Unavailable("the server made a mistake; its log says where"))
+        finally:
+            self._waiting.release()
+            with contextlib.suppress(Exception):
+                _drop(query)
+
+    @staticmethod
+    def _refuse(query: zenoh.Query, error: FleetMapError) -> None:
+        body: dict[str, Any] = {"title": type(error).__name__, "detail": error.detail}
+        if error.problems:
+            body["errors"] = [p.as_dict() for p in error.problems]
+        with contextlib.suppress(Exception):
+            query.reply_err(messages.dumps(body), encoding="application/problem+json")
+
+
+def _end(held: Any) -> None:
+    held.undeclare()
+
+
+def _close(session: Any) -> None:
+    session.close()
+
+
+def _drop(query: Any) -> None:
+    query.drop()
+
+
+def _parameters(query: zenoh.Query) -> dict[str, str]:
+    """A selector's parameters, ``grid=keepout;derive=false``."""
+    out = {}
+    for pair in str(query.parameters).split(";"):
+        name, _, value = pair.partition("=")
+        if name and not name.startswith("_"):  # those with an underscore are Zenoh's own
+            out[name] = value
+    return out
+
+
+def wait_connected(bus: Bus, seconds: float) -> bool:
+    """Until a router is there, at most this long."""
+    deadline = time.monotonic() + seconds
+    while not bus.tend():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.05)
+    return True

@@ -1,0 +1,153 @@
+"""What is said over Zenoh: keys and payloads. The robot's side imports nothing of the server but this and errors."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from app.errors import Invalid, Problem
+
+PREFIX = "fleetmap"
+"""The usual start of every key."""
+
+JSON = "application/json"
+
+EventType = Literal["version.created", "channel.planned", "channel.moved", "environment.created", "environment.deleted"]
+EVENT_TYPES: tuple[EventType, ...] = get_args(EventType)
+
+RobotState = Literal["downloading", "ready", "active", "failed"]
+ROBOT_STATES: tuple[RobotState, ...] = get_args(RobotState)
+
+ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,127}")
+"""A robot's name is one piece of a key and of an address: no slash, no wildcard."""
+
+MAX_STATUS_BYTES = 16 * 2**10
+MAX_DETAIL = 2000
+_CHANNEL = re.compile(r"[a-z][a-z0-9_-]{0,62}")
+_ROOT = re.compile(r"[0-9a-f]{64}")
+
+
+def events_key(prefix: str, environment: str) -> str:
+    """Where the events of an environment are put (``*``: of all)."""
+    return f"{prefix}/{environment}/events"
+
+
+def status_key(prefix: str, environment: str, robot: str) -> str:
+    """Where a robot puts its status."""
+    return f"{prefix}/{environment}/robots/{robot}/status"
+
+
+def robot_key(prefix: str, robot: str) -> str:
+    """A robot's liveliness token."""
+    return f"{prefix}/robots/{robot}"
+
+
+def server_key(prefix: str) -> str:
+    """The server's liveliness token."""
+    return f"{prefix}/server"
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One change of an environment. Robots order by ``sequence``, never by version.
+
+    layers: ``[{layer, level, name, change, hash}]``. previous: ``{version, root}`` or None. body: all members.
+    """
+
+    sequence: int
+    type: EventType
+    environment: str
+    version: int
+    root: str
+    channel: str | None
+    body: Mapping[str, Any]
+
+    @classmethod
+    def from_json(cls, data: bytes | str) -> Event:
+        """An event as it came; Invalid where it is not one. Unknown members are kept in ``body``."""
+        try:
+            body = json.loads(data)
+            kind, channel = body["type"], body.get("channel")
+            sequence, version, root = body["sequence"], body["version"], body["root"]
+            environment = body["environment"]
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise Invalid(f"this is no event: {error}") from None
+        if kind not in EVENT_TYPES or not isinstance(environment, str) or not isinstance(root, str):
+            raise Invalid(f"this is no event: type {kind!r}, environment {environment!r}")
+        for number in (sequence, version):
+            if isinstance(number, bool) or not isinstance(number, int) or number < 0:
+                raise Invalid(f"this is no event: sequence {sequence!r}, version {version!r}")
+        return cls(sequence, kind, environment, version, root, channel, body)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotStatus:
+    """What a robot says of itself. time: RFC 3339, by the robot's clock."""
+
+    channel: str
+    version: int
+    root: str
+    state: RobotState
+    detail: str | None = None
+    time: str | None = None
+    sequence: int | None = None
+
+    @classmethod
+    def from_json(cls, data: bytes | str) -> RobotStatus:
+        """A status as it came; Invalid says what is wrong with it."""
+        if len(data) > MAX_STATUS_BYTES:
+            raise Invalid(f"a status has at most {MAX_STATUS_BYTES} bytes")
+        try:
+            body = json.loads(data)
+        except (ValueError, RecursionError):
+            raise Invalid("a status is a JSON object") from None
+        return cls.from_dict(body)
+
+    @classmethod
+    def from_dict(cls, body: Any) -> RobotStatus:
+        """The same from members that are read already."""
+        if not isinstance(body, Mapping):
+            raise Invalid("a status is a JSON object")
+        problems = []
+
+        def check(name: str, good: bool, accepted: str) -> None:
+            if not good:
+                problems.append(Problem(f"must be {accepted}, got {body.get(name)!r:.80}", where=name))
+
+        channel, version, root = body.get("channel"), body.get("version"), body.get("root")
+        state, detail, time = body.get("state"), body.get("detail"), body.get("time")
+        sequence = body.get("sequence")
+        whole = isinstance(version, int) and not isinstance(version, bool) and 0 <= version < 2**63
+        check("channel", isinstance(channel, str) and _CHANNEL.fullmatch(channel) is not None, "a channel's name")
+        check("version", whole, "a version's number")
+        check("root", isinstance(root, str) and _ROOT.fullmatch(root) is not None, "64 hexadecimal digits")
+        check("state", state in ROBOT_STATES, " or ".join(ROBOT_STATES))
+        check("detail", detail is None or (isinstance(detail, str) and len(detail) <= MAX_DETAIL), "a short text")
+        check("time", time is None or (isinstance(time, str) and len(time) <= 64), "an RFC 3339 time")
+        numbered = isinstance(sequence, int) and not isinstance(sequence, bool) and 0 <= sequence < 2**63
+        check("sequence", sequence is None or numbered, "an event's number")
+        if problems:
+            raise Invalid("; ".join(f"{p.where} {p.problem}" for p in problems), problems)
+        known = next(s for s in ROBOT_STATES if s == state)
+        return cls(str(channel), int(version or 0), str(root), known, detail, time, sequence)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The status without its empty members."""
+        members = {
+            "channel": self.channel,
+            "version": self.version,
+            "root": self.root,
+            "state": self.state,
+            "detail": self.detail,
+            "time": self.time,
+            "sequence": self.sequence,
+        }
+        return {name: value for name, value in members.items() if value is not None}
+
+
+def dumps(value: Mapping[str, Any]) -> bytes:
+    """A payload: compact JSON in UTF-8."""
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode()

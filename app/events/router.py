@@ -1,0 +1,84 @@
+"""The Zenoh router of the embedded default, in a process of its own: native threads of a router and a server that
+forks or is killed do not mix. It ends when its standard input does, that is with the server that started it.
+
+``python -m app.events.router`` reads one line of JSON5 (the configuration), prints ``listening`` or why not.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+START_SECONDS = 20.0
+
+
+class Router:
+    """A router process. ``problem`` says why it does not run."""
+
+    def __init__(self, configuration: str) -> None:
+        self.problem: str | None = None
+        package = Path(__file__).resolve().parents[2]
+        env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(package), os.environ.get("PYTHONPATH")]))}
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "app.events.router"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=env,
+            text=True,
+            start_new_session=True,  # Ctrl-C in a terminal ends the server, which ends the router
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        timer = threading.Timer(START_SECONDS, self._process.kill)
+        timer.start()
+        try:
+            self._process.stdin.write(configuration.replace("\n", " ") + "\n")
+            self._process.stdin.flush()
+            line = self._process.stdout.readline().strip()
+        except OSError as error:
+            line = str(error)
+        finally:
+            timer.cancel()
+        if line != "listening":
+            self.problem = line or "the router did not start"
+            self.close()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still runs."""
+        return self._process.poll() is None
+
+    def close(self) -> None:
+        """End it."""
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
+        try:
+            self._process.wait(3)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def main() -> int:
+    """Run a router until standard input ends."""
+    import zenoh
+
+    zenoh.init_log_from_env_or("error")
+    configuration = sys.stdin.readline()
+    try:
+        session = zenoh.open(zenoh.Config.from_json5(configuration))
+    except Exception as error:  # noqa: BLE001  zenoh raises its own class for all; the parent tells it
+        print(str(error).splitlines()[0][:500] if str(error) else "the router did not start", flush=True)
+        return 1
+    print("listening", flush=True)
+    sys.stdin.read()
+    session.close()  # type: ignore[no-untyped-call, unused-ignore]
+    return 0
+
+
+if __name__ == "__main__":
+    os._exit(main())  # a zenoh session's threads can outlive close() and hold the interpreter back

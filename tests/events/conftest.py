@@ -1,0 +1,98 @@
+"""Real Zenoh sessions and routers on loopback."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from zenoh import ext
+
+from tests.api.conftest import Api, running, settings_for
+
+
+def free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+def client_config(port: int, **more: Any) -> zenoh.Config:
+    config = zenoh.Config()
+    values = {
+        "mode": "client",
+        "connect/endpoints": [f"tcp/127.0.0.1:{port}"],
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+        **more,
+    }
+    for key, value in values.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Listener:
+    """A robot's ear: an advanced subscriber with history and recovery, as the contract recommends."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self.events: list[dict[str, Any]] = []
+        self._news = threading.Condition()
+        self.subscriber = ext.declare_advanced_subscriber(
+            session,
+            key,
+            self._take,
+            history=ext.HistoryConfig(detect_late_publishers=True),
+            recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+        )
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        with self._news:
+            self.events.append(json.loads(bytes(sample.payload)))
+            self._news.notify_all()
+
+    def sequences(self) -> list[int]:
+        """Each sequence once, in the order they first came."""
+        return list(dict.fromkeys(e["sequence"] for e in self.events))
+
+    def wait(self, condition: Callable[[Listener], bool], seconds: float = 20.0) -> None:
+        with self._news:
+            assert self._news.wait_for(lambda: condition(self), seconds), [e["sequence"] for e in self.events]
+
+
+def eventually(condition: Callable[[], Any], seconds: float = 20.0) -> Any:
+    deadline = time.monotonic() + seconds
+    while True:
+        found = condition()
+        if found:
+            return found
+        assert time.monotonic() < deadline, "it did not come about in time"
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture
+def api(tmp_path: Path, port: int) -> Iterator[Api]:
+    """A server with a router of its own on ``port``."""
+    with running(settings_for(tmp_path, zenoh_mode="router", zenoh_listen=f"tcp/127.0.0.1:{port}")) as api:
+        eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
+        yield api
+
+
+@pytest.fixture
+def session(api: Api, port: int) -> Iterator[zenoh.Session]:
+    """A robot's session."""
+    made = zenoh.open(client_config(port))
+    try:
+        yield made
+    finally:
+        made.close()  # type: ignore[no-untyped-call]
