@@ -18,7 +18,7 @@ from app import __version__, derive, formats, parameters
 from app.derive import Step
 from app.errors import Invalid, MissingDatum, MissingLayer, Problem
 from app.formats import Format
-from app.model.layers import LAYERS, Layer, PartKey
+from app.model.layers import LAYERS, MAP, Layer, PartKey
 from app.store.values import PartEntry, Version
 
 SUPPLY: Mapping[Layer, str] = {
@@ -138,6 +138,9 @@ def chain(
             without |= rivals
     if known.needs.datum and not available.datum:
         raise MissingDatum(f"{known.name} needs {SUPPLY['location']}")
+    named = _named(known, available, options, asked, without) if derived else None
+    if named is not None:
+        return named
     best = _best(known, available, without, derived=derived)
     rest = asked.keys() - {f.name for f in dataclasses.fields(known.write_options)}
     if rest and (best is None or not rest <= _taken(best)):
@@ -157,6 +160,25 @@ def chain(
     remembered = {name: value for steps in available.pinned.values() for name, value in steps.items()}
     steps = [derive.with_values([s], {**remembered.get(s.name, {}), **asked})[0] for s in best.steps]
     return Chain(tuple(steps), tuple(keys))
+
+
+def _named(
+    known: Format, available: Stock, options: Any, asked: Mapping[str, str], without: frozenset[str]
+) -> Chain | None:
+    """The way to a part that is asked for by name and not stored, where a derivation makes parts of that name."""
+    wish = known.named(options)
+    if wish is None or any((k.layer, k.name) == wish for k in available.keys):
+        return None
+    layer, name = wish
+    further = asked.keys() - {f.name for f in dataclasses.fields(known.write_options)}
+    for d in sorted(derive.all_derivations().values(), key=lambda d: (d.cost, d.name)):
+        if d.gives != layer or name not in d.makes or not d.needs <= available.layers or d.name in without:
+            continue
+        if further <= derive.takes(d.name):
+            keys = sorted(k for k in available.keys if k.layer in d.needs or (k.layer, k.name) == (layer, MAP))
+            before = available.pinned.get(layer, {}).get(d.name, {})
+            return Chain(derive.with_values([d.step()], {**before, **asked}), tuple(keys))
+    return None
 
 
 def _best(known: Format, available: Stock, without: frozenset[str], *, derived: bool = True) -> derive.Plan | None:

@@ -50,7 +50,12 @@ Function = Callable[[Layers, Any, Notes], Layers]
 @dataclass(frozen=True, slots=True)
 class Derivation:
     """One step. gives: the layer it makes. needs: the layers it reads. also: stored layers that it uses a part of where
-    they are there, and does without where they are not. cost: relative effort and loss, above 0."""
+    they are there, and does without where they are not. cost: relative effort and loss, above 0.
+
+    makes: names of the parts that it makes, where these are others than the usual one. Such a step is no way to the
+    layer; it is taken where a part of such a name is asked for and not stored, and is given the layer's usual part,
+    whose frame it may take.
+    """
 
     name: str
     title: str
@@ -61,6 +66,7 @@ class Derivation:
     parameters: type[Any]
     function: Function
     also: frozenset[Layer] = frozenset()
+    makes: frozenset[str] = frozenset()
 
     def step(self) -> Step:
         """The derivation as it stands in a plan, with its default parameters."""
@@ -109,6 +115,7 @@ def derives(
     cost: float,
     version: int = 1,
     also: frozenset[Layer] = frozenset(),
+    makes: frozenset[str] = frozenset(),
 ) -> Callable[[Function], Function]:
     """Declare a function as a derivation; its name is its id, its docstring's first line its title."""
 
@@ -117,7 +124,8 @@ def derives(
         if name in _registry:
             raise ValueError(f"derivation {name} is declared twice")
         title = (function.__doc__ or name).strip().splitlines()[0]
-        _registry[name] = Derivation(name, title, gives, frozenset(needs), cost, version, parameters, function, also)
+        known = (title, gives, frozenset(needs), cost, version, parameters, function, also, makes)
+        _registry[name] = Derivation(name, *known)
         return function
 
     return declare
@@ -152,7 +160,7 @@ def plan(available: frozenset[Layer], wanted: frozenset[Layer], without: frozens
             continue
         done.add(have)
         for d in all_derivations().values():
-            if d.needs <= have and d.gives not in have and d.name not in without:
+            if d.needs <= have and d.gives not in have and d.name not in without and not d.makes:
                 pushed += 1
                 heapq.heappush(queue, (cost + d.cost, pushed, have | {d.gives}, (*steps, d.step())))
     return None

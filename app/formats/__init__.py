@@ -151,10 +151,11 @@ class Format:
     where grids lie, not their cells. joined: its main files of one folder are one map (graphs 0.yaml, 1.yaml …).
     check: the loader rules of the map's consumers, looked at in a map's files (main file first) without our reader
     or writer; ``app.formats.check`` says what it gives and what it may cost.
-    looks_at: files of other maps of the upload that it looks into.
     yields: a main file of this name only speaks for others (a world file for its picture), so it is none where one of
     those is a main file itself. lacking: what a file needs that may be such a map but does not say enough by itself (a
     picture without a place); empty for other files. completing: the read options that say it.
+    looks_at: files of other maps of the upload that it looks into. named: the part (layer, name) that these options
+    ask for by name, if they do.
     """
 
     name: str
@@ -177,6 +178,7 @@ class Format:
     extensions: tuple[str, ...] = ()
     choose: Callable[[Sequence[PartKey], Any], Sequence[PartKey]] = lambda keys, options: keys
     by_file: Callable[[str], Mapping[str, str]] = lambda name: {}
+    named: Callable[[Any], tuple[Layer, str] | None] = lambda options: None
     outlines: bool = False
     joined: bool = False
     check: Callable[[Files], Iterable[Problem]] | None = None

@@ -40,7 +40,7 @@ from app.formats import (
 from app.formats._choice import the_one
 from app.model.frame import MAX_METRES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, Mode, OccupancyGrid, outline
-from app.model.layers import MAP, Layers, PartKey
+from app.model.layers import MAP, Layer, Layers, PartKey
 from app.parameters import parameter
 
 NAME = "occupancy_grid"
@@ -370,6 +370,11 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     return the_one(keys, "occupancy", options.grid, options.level, what="grid", option="grid", supply=supply)
 
 
+def named(options: WriteOptions) -> tuple[Layer, str] | None:
+    """The grid that is asked for by name."""
+    return ("occupancy", options.grid) if options.grid is not None else None
+
+
 def by_file(name: str) -> dict[str, str]:
     """``keepout.yaml``, ``keepout.pgm`` and ``keepout_filter_info.yaml`` are the grid ``keepout``; ``keepout.png`` asks
     for a PNG, too."""
@@ -632,6 +637,7 @@ register(
         write_options=WriteOptions,
         choose=choose,
         by_file=by_file,
+        named=named,
         check=_occupancy_grid_rules.check,
         rank=40,
         version=2,

@@ -10,7 +10,7 @@ from app import derive, parameters
 from app.derive import Notes, Step
 from app.errors import CannotDerive, Conflict, Invalid, MissingLayer, NotFound, Problem
 from app.ingest.prepare import open_store
-from app.model.layers import Layer, Layers, PartKey, is_empty
+from app.model.layers import MAP, Layer, Layers, PartKey, is_empty
 from app.store.changes import Changes, Prepared, Provenance, Replace
 from app.store.values import PartEntry, Version, frame_line
 
@@ -57,7 +57,7 @@ def prepare_derivation(
         steps = _steps(known, frozenset(k.layer for k in stored), base, without, failed)
         needed = {layer for step in steps for layer in step.reads}
         used = {k: e for k, e in stored.items() if k.layer in needed}
-        used |= {k: e for k, e in own.items() if known.gives in needed}
+        used |= {k: e for k, e in own.items() if known.gives in needed or (known.makes and k.name == MAP)}
         # Not only the layers that are needed: a derivation may look at others where they are there (a fence).
         loaded = store.load(base, sorted(used))
         notes = Notes()

@@ -1,0 +1,262 @@
+"""Drawn zones -> Nav2's costmap filter masks, so that a keepout drawn in Google Earth or QGIS is had as keepout.yaml.
+
+Zones of kind ``keepout`` (and ``preferred``: lanes that robots should keep to) make the grid ``keepout``, those of kind
+``speed`` the grid ``speed``; what the cells mean goes with each grid (``app.model.masks``). Every cell that a zone
+touches is in it, so that nobody drives a little way into a keepout; a lane has only cells whose middle it holds.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import Notes, derives
+from app.errors import CannotConvert, MissingLayer
+from app.model import masks
+from app.model.features import Features
+from app.model.grid import FREE, OCCUPIED, OccupancyGrid
+from app.model.layers import MAP, Layers, Part, PartKey
+from app.model.masks import Info
+from app.parameters import parameter
+
+KEEPOUT, SPEED = "keepout", "speed"
+KEEPOUTS = frozenset({"keepout", "keep_out", "no_go", "nogo", "forbidden"})
+LANES = frozenset({"preferred", "preferred_lane", "lane"})
+SPEEDS = frozenset({"speed", "speed_limit", "speed_zone"})
+
+RESOLUTION = 0.05
+"""Metres a cell where there is no map to take it from: what Nav2's maps usually have."""
+
+MARGIN = 1.0
+"""Metres around the zones of a level without a map."""
+
+STEPS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+"""Metres per second that one step of a cell may stand for: the finest one is taken that reaches the highest limit."""
+
+MOST_CELLS = 2**28
+_SAID = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%|percent|m/s)?\s*\Z", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """How fine the masks are, and what speed limits are said in."""
+
+    resolution: float | None = parameter(
+        None, "size of a cell; default: the map's, else 0.05 m", minimum=1e-3, maximum=1e3, unit="m"
+    )
+    speed_in: Literal["percent", "m/s"] | None = parameter(
+        None, "what the cells of the speed mask stand for; default: m/s, or percent where every zone says percent"
+    )
+    max_speed: float | None = parameter(
+        None, "the robot's top speed, between limits in percent and in m/s", minimum=1e-3, maximum=1e3, unit="m/s"
+    )
+    lane_cost: int = parameter(50, "value of cells beside preferred lanes, where there are any", minimum=1, maximum=99)
+
+
+@derives(
+    gives="occupancy",
+    needs={"zones"},
+    parameters=Parameters,
+    cost=1.0,
+    makes=frozenset({KEEPOUT, SPEED}),
+)
+def zones_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+    """Keepout and speed zones as costmap filter masks, the grids keepout and speed, in the frame of the level's map.
+
+    Raises MissingLayer where no zone is of these kinds, MissingDatum for zones on earth without a datum, CannotConvert
+    for masks that are too large or speeds that cannot be said.
+    """
+    parts: dict[PartKey, Part] = {}
+    for level in dict.fromkeys(key.level for key in layers.vector("zones")):
+        zones = _zones(layers, level, notes)
+        if not zones:
+            continue
+        frame = _frame(layers, level, [z.shape for z in zones], parameters.resolution)
+        _report_outside(zones, frame, level, notes)
+        blocked = [z.shape for z in zones if z.kind in KEEPOUTS]
+        lanes = [z.shape for z in zones if z.kind in LANES]
+        if blocked or lanes:
+            cells = np.full((frame.height, frame.width), parameters.lane_cost if lanes else FREE, np.uint8)
+            _burn(cells, frame, lanes, [FREE] * len(lanes), touched=False)
+            _burn(cells, frame, blocked, [OCCUPIED] * len(blocked), touched=True)
+            if lanes:
+                notes.fill("cost beside preferred lanes", parameters.lane_cost, "no zone says it; see lane_cost")
+            parts[PartKey("occupancy", level, KEEPOUT)] = frame.grid(cells, KEEPOUT, Info(masks.KEEPOUT, 0.0, 1.0))
+        slow = [z for z in zones if z.kind in SPEEDS]
+        values, info = _limits(slow, parameters, notes) if slow else ([], None)
+        if info is not None:
+            cells = np.full((frame.height, frame.width), FREE, np.uint8)
+            # What is drawn last stands: of zones that overlap, the lowest limit.
+            order = sorted((k for k, v in enumerate(values) if v), key=lambda k: -values[k])
+            _burn(cells, frame, [slow[k].shape for k in order], [values[k] for k in order], touched=True)
+            parts[PartKey("occupancy", level, SPEED)] = frame.grid(cells, SPEED, info)
+    if not parts:
+        raise MissingLayer(
+            "masks are made of zones of kind keepout, preferred or speed (with a value), and there are none: upload a "
+            "drawing with layer=zones, or put zones of these kinds by an edit"
+        )
+    return Layers(parts, layers.datum, layers.levels)
+
+
+@dataclass(frozen=True, slots=True)
+class _Zone:
+    """A zone in local metres."""
+
+    id: str
+    kind: str
+    value: Any
+    shape: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """Where a mask lies: its lower left corner in metres, its cells."""
+
+    x: float
+    y: float
+    resolution: float
+    width: int
+    height: int
+
+    def grid(self, cells: NDArray[np.uint8], name: str, info: Info) -> OccupancyGrid:
+        """The mask; ``scale`` from white to black says each of its values."""
+        told = {masks.NAME: {"params": masks.params(name, info)}}
+        return OccupancyGrid(cells, self.resolution, (self.x, self.y, 0.0), "scale", 1.0, 0.0, False, told)
+
+    def box(self) -> Any:
+        """Its outline."""
+        return shapely.box(
+            self.x, self.y, self.x + self.width * self.resolution, self.y + self.height * self.resolution
+        )
+
+
+def _zones(layers: Layers, level: str, notes: Notes) -> list[_Zone]:
+    """The zones of a level that masks are made of, in the order of their parts and ids."""
+    out = []
+    other = expiring = flat = 0
+    for part in layers.vector("zones", level).values():
+        for zone, p in _shapes(part, layers):
+            if zone.kind not in KEEPOUTS | LANES | SPEEDS:
+                other += 1
+            elif shapely.get_dimensions(zone.shape) < 2 or zone.shape.is_empty:
+                flat += 1
+            else:
+                expiring += p.get("expires") is not None
+                out.append(zone)
+    notes.drop("zones of other kinds", other, "masks say keepout, preferred lanes and speed limits only")
+    notes.drop("zones without an area", flat, "they are no polygons")
+    if expiring:
+        notes.warn(f"{expiring} zones end at some time: the masks hold them until they are made anew")
+    return out
+
+
+def _shapes(part: Features, layers: Layers) -> Iterator[tuple[_Zone, Any]]:
+    geometry = shapely.force_2d(part.in_local(layers.frame))
+    broken = ~shapely.is_valid(geometry)
+    if broken.any():
+        geometry = geometry.copy()
+        geometry[broken] = shapely.make_valid(geometry[broken])
+    for i, p, shape in zip(part.ids, part.properties, geometry, strict=True):
+        yield _Zone(i, str(p.get("kind", "")).strip().lower().replace(" ", "_"), p.get("value"), shape), p
+
+
+def _frame(layers: Layers, level: str, shapes: list[Any], resolution: float | None) -> _Frame:
+    """The map's frame where there is one (its cells, or its place in other cells), else one around the zones."""
+    known = layers.grids(level).get(PartKey("occupancy", level, MAP))
+    if known is not None and known.origin[2] == 0.0 and resolution in (None, known.resolution):
+        return _Frame(known.origin[0], known.origin[1], known.resolution, known.width, known.height)
+    if known is None:
+        low_high = shapely.total_bounds(np.array(shapes, object)) + MARGIN * np.array([-1.0, -1.0, 1.0, 1.0])
+    else:
+        corners = known.corners()
+        low_high = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
+    cell = resolution or (RESOLUTION if known is None else known.resolution)
+    first = [math.floor(v / cell + 1e-6) for v in low_high[:2]]
+    end = [math.ceil(v / cell - 1e-6) for v in low_high[2:]]
+    width, height = (max(1, b - a) for a, b in zip(first, end, strict=True))
+    if width * height > MOST_CELLS:
+        raise CannotConvert(f"a mask of {width} × {height} cells is too large: ask for a coarser resolution")
+    return _Frame(round(first[0] * cell, 9), round(first[1] * cell, 9), cell, width, height)
+
+
+def _report_outside(zones: list[_Zone], frame: _Frame, level: str, notes: Notes) -> None:
+    box = frame.box()
+    outside = [z.id for z in zones if not z.shape.intersects(box)]
+    cut = sum(not box.covers(z.shape) for z in zones) - len(outside)
+    notes.drop("zones outside of the map", len(outside), f"the masks of {level} are as large as its map")
+    notes.drop("parts of zones outside of the map", cut, f"the masks of {level} are as large as its map")
+
+
+def _burn(cells: NDArray[np.uint8], frame: _Frame, shapes: list[Any], values: list[int], *, touched: bool) -> None:
+    """Draw polygons into cells (row 0 at the bottom), one over the other."""
+    if not shapes:
+        return
+    from rasterio.features import rasterize  # type: ignore[import-untyped]
+    from rasterio.transform import Affine  # type: ignore[import-untyped]
+
+    size = frame.resolution
+    to_metres = Affine(size, 0.0, frame.x, 0.0, size, frame.y)
+    drawn = list(zip(shapes, values, strict=True))
+    rasterize(drawn, out=cells, transform=to_metres, all_touched=touched)
+
+
+def _limits(zones: list[_Zone], parameters: Parameters, notes: Notes) -> tuple[list[int], Info | None]:
+    """(the cell of each zone, 0 where it has no limit; what cells stand for, None where there is no limit at all).
+
+    Limits are rounded down to what a cell can say, and never to 0, which would be none.
+    """
+    said = [_said(z) for z in zones]
+    notes.drop("speed zones without a limit", said.count(None), "their value is no speed in m/s and no percentage")
+    known = [s for s in said if s is not None]
+    if not known:
+        return [], None
+    percent = parameters.speed_in == "percent" or (parameters.speed_in is None and all(p for _, p in known))
+    if parameters.max_speed is None and any(p is not percent for _, p in known):
+        raise CannotConvert(
+            "limits in percent and in m/s can only be brought together with the robot's top speed: ask with "
+            "max_speed=… (m/s)"
+        )
+    top = parameters.max_speed or 1.0
+    exact: list[float | None] = []
+    for limit in said:
+        if limit is None:
+            exact.append(None)
+        elif percent:
+            exact.append(limit[0] if limit[1] else limit[0] / top * 100.0)
+        else:
+            exact.append(limit[0] / 100.0 * top if limit[1] else limit[0])
+    step = 1.0
+    if not percent:
+        highest = max(v for v in exact if v is not None)
+        step = next((s for s in STEPS if highest <= 100 * s + 1e-9), STEPS[-1])
+    values, rounded, stopped = [], 0, 0
+    for value in exact:
+        if value is None or (percent and value > 100.0):
+            values.append(0)
+            continue
+        cell = min(100, max(1, math.floor(value / step + 1e-6)))
+        stopped += value <= 0.0
+        rounded += abs(cell * step - value) > 1e-6
+        values.append(cell)
+    unit = "%" if percent else "m/s"
+    notes.drop("exact speed limits", rounded, f"a cell says multiples of {step:g} {unit}; limits are rounded down")
+    if stopped:
+        notes.warn(f"{stopped} speed zones have the limit 0, which Nav2 takes for none: they get {step:g} {unit}")
+    kind = masks.SPEED_PERCENT if percent else masks.SPEED_METRES
+    return values, Info(kind, 0.0, step) if any(values) else None
+
+
+def _said(zone: _Zone) -> tuple[float, bool] | None:
+    """A zone's limit and whether it is a percentage: a number is m/s, a text may name its unit."""
+    value = zone.value
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return (float(value), False) if value >= 0 and math.isfinite(value) else None
+    found = _SAID.match(value) if isinstance(value, str) else None
+    return None if found is None else (float(found[1]), found[2] in ("%", "percent"))
