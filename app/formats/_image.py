@@ -108,11 +108,13 @@ def read_image(data: bytes, limits: Limits) -> Image.Image:
     names = {"png": "PNG", "jpeg": "JPEG", "bmp": "BMP", "pgm": "PPM"}
     # struct.error, SyntaxError and the like: what Pillow raises on input that is not what it says.
     try:
-        image = Image.open(io.BytesIO(data), formats=[names[kind]])
+        stream = io.BytesIO(data)
+        image = Image.open(stream, formats=[names[kind]])
         _check_size(image.width, image.height, limits)
         if kind == "bmp" and image.info.get("compression") == 0:
             _check_bmp(image, data)
         image.load()
+        stream.close()  # some pictures would hold on to their file's bytes
     except (OSError, SyntaxError, ValueError, LookupError, TypeError, EOFError, struct.error, zlib.error) as error:
         reason = str(error) or type(error).__name__
         raise UnreadableFile(f"the {names[kind]} picture is damaged or cut short: {reason}") from error
@@ -128,7 +130,10 @@ def encode_png(pixels: Bytes, *, flip: bool = False, palette: Bytes | None = Non
     height, width = pixels.shape[:2]
     bands = 1 if pixels.ndim == 2 else pixels.shape[2]
     colour = 3 if palette is not None else {1: 0, 2: 4, 3: 2, 4: 6}[bands]
-    out = [PNG_MAGIC, _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, colour, 0, 0, 0))]
+    out: list[bytes | memoryview] = [
+        PNG_MAGIC,
+        _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, colour, 0, 0, 0)),
+    ]
     if palette is not None:
         out += [_chunk(b"PLTE", palette[:, :3].tobytes()), _chunk(b"tRNS", palette[:, 3].tobytes())]
     # Grids are runs of few values: matching runs alone is as quick as the fastest general level, half the size, and
@@ -146,8 +151,12 @@ def encode_png(pixels: Bytes, *, flip: bool = False, palette: Bytes | None = Non
         packed.append(packer.compress(lines.data))
     packed.append(packer.flush())
     body = b"".join(packed)
+    del packed  # the packed pixels may be as large as the picture: no more than two copies of them at a time
     limit = 2**30
-    out += [_chunk(b"IDAT", body[i : i + limit]) for i in range(0, len(body), limit)]
+    pieces = [memoryview(body)[i : i + limit] for i in range(0, len(body), limit)]
+    for piece in pieces:
+        sum_of = zlib.crc32(piece, zlib.crc32(b"IDAT"))
+        out += [struct.pack(">I", len(piece)) + b"IDAT", piece, struct.pack(">I", sum_of)]
     return b"".join([*out, _chunk(b"IEND", b"")])
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-CACHE = 64 * 2**20
+CACHE = 32 * 2**20
 """Bytes of decoded blocks that GDAL keeps."""
 
 DATA_TYPES = {

@@ -103,9 +103,9 @@ def placed(transform: Affine, column: NDArray[np.float64], row: NDArray[np.float
 def displayed(picture: Picture) -> NDArray[np.uint8]:
     """A picture as screens show it: uint8 [height, width, 1…4] (grey, grey + alpha, RGB, RGBA).
 
-    8-bit values stay as they are; others are stretched, so that the least becomes 0 and the greatest 255, all bands
-    alike. Bands beyond the colours are left out, a palette is looked up. No-data and numbers that are none become
-    transparent.
+    8-bit values stay as they are (the picture's own pixels, where nothing has to be changed); others are stretched, so
+    that the least becomes 0 and the greatest 255, all bands alike. Bands beyond the colours are left out, a palette is
+    looked up. No-data and numbers that are none become transparent.
     """
     pixels, colours = picture.pixels, picture.colours
     height, width, _ = pixels.shape
@@ -118,6 +118,8 @@ def displayed(picture: Picture) -> NDArray[np.uint8]:
         shown = [first if first is not None else next((k for k in range(len(colours)) if k != clear), 0)]
     nodata = picture.nodata
     holes = clear is not None or nodata is not None or pixels.dtype.kind == "f"
+    if pixels.dtype == np.uint8 and table is None and colours == USUAL_COLOURS.get(len(colours)) and nodata is None:
+        return pixels
     rows = max(1, STRIP // width)
     low, high = (0.0, 255.0) if pixels.dtype == np.uint8 or table is not None else _range(picture, shown, rows)
     if table is not None:

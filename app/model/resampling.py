@@ -1,7 +1,7 @@
 """A picture in any CRS -> the same place on another grid: north up, square pixels, in the local frame or in a CRS.
 
 Stored pictures keep their pixels and their grid; whoever needs them elsewhere resamples them here, on use. Every target
-pixel is looked up through PROJ, to a millionth of a pixel, so that nothing is approximated but values between pixels.
+pixel is looked up through PROJ, to a ten thousandth of a pixel: nothing else is approximated but values between pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from app.model.geodesy import WGS84, LocalFrame, between
 from app.model.imagery import CLEAR, LOCAL, Affine, Picture, placed
 
 Method = Literal["nearest", "bilinear", "cubic"]
-TOLERANCE = 1e-6
+TOLERANCE = 1e-4
 """Pixels of the source by which the place of a pixel may be off; GDAL takes no 0."""
 
 STEPS = 64
@@ -171,7 +171,7 @@ def _warped(
             width=shape[1],
             resampling=rasterio.enums.Resampling[method],
             tolerance=TOLERANCE,
-            warp_mem_limit=64,
+            warp_mem_limit=32,
             **options,
         ) as warped:
             return np.moveaxis(warped.read(), 0, 2), properties
