@@ -29,6 +29,7 @@ KINDS = {
     "nav2_route_graph": "nav2_route",
     "lif": "lif",
     "geotiff": "satellite",
+    "sdf": "gazebo",
 }
 
 REFUSED = {
@@ -62,7 +63,8 @@ def samples() -> list[Any]:
     if not path.is_file():
         return [pytest.param("", "", id="absent")]
     known = json.loads(path.read_text())["files"]
-    return [pytest.param(n, KINDS[e["kind"]], id=n) for n, e in known.items() if e["kind"] in KINDS]
+    maps = {n: e for n, e in known.items() if e["kind"] in KINDS and (e["kind"] != "sdf" or e["facts"]["worlds"])}
+    return [pytest.param(n, KINDS[e["kind"]], id=n) for n, e in maps.items()]
 
 
 @pytest.fixture(scope="module", params=["sqlite", "postgres"])
@@ -81,6 +83,10 @@ def api(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 def files_of(data: Path, name: str, kind: str) -> dict[str, bytes]:
     path = data / name
+    if kind == "gazebo":  # a world with all that lies below its folder, or beside the folder of the worlds
+        root = path.parent.parent if path.parent.name == "worlds" else path.parent
+        found = [p for p in root.rglob("*") if p == path or (p.is_file() and p.parent != path.parent)]
+        return {p.relative_to(root).as_posix(): p.read_bytes() for p in found}
     if kind != "occupancy_grid":
         return {path.name: path.read_bytes()}
     found = [p for p in path.parent.rglob("*") if p == path or p.suffix.lower() in (".pgm", ".png")]

@@ -181,6 +181,7 @@ class Format:
     named: Callable[[Any], tuple[Layer, str] | None] = lambda options: None
     outlines: bool = False
     joined: bool = False
+    sort: Callable[[Files, Sequence[str]], Mapping[str, Iterable[str]]] | None = None
     check: Callable[[Files], Iterable[Problem]] | None = None
     yields: Callable[[str], bool] = lambda name: False
     lacking: Callable[[str, bytes], str] = lambda name, data: ""
@@ -256,6 +257,7 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
             raise Invalid(f"{asked.name} can be served but not read")
         main = next((n for n in sorted(files) if n.lower().endswith(asked.extensions)), None)
         groups = [(asked, main or next(iter(sorted(files))))]
+    groups, belong = _sorted(files, groups)
     out = []
     mains = {main for _, main in groups}
     yielding = {
@@ -271,7 +273,8 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
         if known.joined:
             joined.setdefault((known.name, main.rpartition("/")[0]), []).append(main)
     for known, main in groups:
-        others = [n for n in known.companions(main, files[main], sorted(files)) if n in files and n not in mains]
+        more = belong[main] if main in belong else known.companions(main, files[main], sorted(files))
+        others = [n for n in more if n in files and n not in mains]
         if known.joined:
             first, *further = joined[known.name, main.rpartition("/")[0]]
             if main != first:
@@ -282,6 +285,19 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
         seen = {n: files[n] for n in known.looks_at(main, sorted(files)) if n in files and n not in own}
         out.append(Group(known, main, own, seen))
     return out, sorted(set(files) - used)
+
+
+def _sorted(
+    files: Files, groups: Sequence[tuple[Format, str]]
+) -> tuple[list[tuple[Format, str]], dict[str, Iterable[str]]]:
+    """The main files that stay ones, and what belongs to those of formats that look into the files."""
+    belong: dict[str, Iterable[str]] = {}
+    for known in dict.fromkeys(known for known, _ in groups):
+        if known.sort is not None:
+            belong |= {m: list(o) for m, o in known.sort(files, [m for k, m in groups if k is known]).items()}
+    claimed = {name for others in belong.values() for name in others}
+    kept = [(k, m) for k, m in groups if (m in belong if k.sort is not None else m not in claimed)]
+    return kept, belong
 
 
 BAD_INPUT = (

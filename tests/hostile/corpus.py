@@ -1293,6 +1293,129 @@ def cloud_cases() -> Iterator[Case]:
         yield case(f"laz, ones at byte {at}", laz[:at] + b"\xff" * 4 + laz[at + 4 :], "any", "laz")
 
 
+def sdf_cases() -> Iterator[Case]:
+    """Worlds whose includes, meshes, numbers and lists are not what they say."""
+
+    def upload(inner: str, more: dict[str, bytes] | None = None, version: str = "1.7") -> dict[str, bytes]:
+        world = f'<sdf version="{version}"><world name="w">{inner}</world></sdf>'
+        return {"a.world": world.encode(), **(more or {})}
+
+    def body(geometry: str) -> str:
+        part = f"<link name='l'><collision name='c'><geometry>{geometry}</geometry></collision></link>"
+        return f"<model name='m'>{part}</model>"
+
+    def model(inner: str) -> bytes:
+        return f'<sdf version="1.7"><model name="m">{inner}</model></sdf>'.encode()
+
+    for name, doctype in {
+        "entity": "<!DOCTYPE sdf [<!ENTITY a 'aaaa'>]>",
+        "outside entity": "<!DOCTYPE sdf [<!ENTITY a SYSTEM 'file:///etc/passwd'>]>",
+        "parameter entity": "<!DOCTYPE sdf SYSTEM 'http://127.0.0.1:1/a.dtd'>",
+    }.items():
+        text = f"{doctype}<sdf version='1.7'><world name='w'><model name='m'>&a;</model></world></sdf>"
+        yield Case(f"sdf/{name}", {"a.world": text.encode()}, "refused", "gazebo")
+    many = "".join(f"<!ENTITY a{k} '{f'&a{k - 1};' * 10}'>" for k in range(1, 10))
+    laughs = f"<!DOCTYPE sdf [<!ENTITY a0 'ha'>{many}]><sdf version='1.7'><world name='&a9;'/></sdf>"
+    yield Case("sdf/billion laughs", {"a.world": laughs.encode()}, "refused", "gazebo")
+    include = "<xi:include xmlns:xi='http://www.w3.org/2001/XInclude' href='file:///etc/passwd' parse='text'/>"
+    yield Case("sdf/xinclude", upload(f"<model name='m'>{include}</model>"), "read")
+    yield Case("sdf/deep models", upload("<model name='m'>" * 60 + "</model>" * 60), "refused")
+    yield Case("sdf/deep elements", upload("<plugin name='p'>" + "<a>" * 5000 + "</a>" * 5000 + "</plugin>"), "refused")
+    yield Case("sdf/deep plugin", upload("<plugin name='p'>" + "<a>" * 150 + "</a>" * 150 + "</plugin>"), "read")
+    yield Case("sdf/many attributes", upload("<model %s/>" % " ".join(f"a{k}='1'" for k in range(300))), "any")
+    yield Case("sdf/endless name", upload(f"<model name='{'a' * 100_000}'/>"), "refused")
+    yield Case(
+        "sdf/reserved names", upload("<model name='world'/><model name='__root__'/><model name='a::b'/>"), "read"
+    )
+    yield Case("sdf/no names", upload("<model/><model/><include/><light/>"), "read")
+    yield Case("sdf/one name", upload("<model name='m'/>" * 300), "read")
+    for number in ("nan", "inf", "-1e999", "1e300", HUGE, "1,5", "0x10", "١", "1_0", "--1"):
+        short = number[:8]
+        yield Case(f"sdf/pose {short}", upload(f"<model name='m'><pose>{number} 0 0 0 0 0</pose></model>"), "refused")
+        yield Case(f"sdf/size {short}", upload(body(f"<box><size>{number} 1 1</size></box>")), "refused")
+        place = f"<spherical_coordinates><latitude_deg>{number}</latitude_deg></spherical_coordinates>"
+        yield Case(f"sdf/latitude {short}", upload(place), "refused")
+    yield Case("sdf/huge angle", upload("<model name='m'><pose>0 0 0 1e7 -1e7 1e7</pose></model>"), "read")
+    yield Case("sdf/negative size", upload(body("<box><size>-1 1 1</size></box>")), "any")
+    yield Case("sdf/huge sphere", upload(body("<sphere><radius>9e6</radius></sphere>")), "any")
+    yield Case("sdf/zero normal", upload(body("<plane><normal>0 0 0</normal><size>1 1</size></plane>")), "any")
+    yield Case("sdf/many points", upload(body("<polyline>" + "<point>1 2</point>" * 100_000 + "</polyline>")), "any")
+    chain = "".join(f"<model name='m{k}'><pose relative_to='m{k + 1}'>1 0 0 0 0 0</pose></model>" for k in range(5000))
+    yield Case("sdf/long chain of frames", upload(chain), "read")
+    yield Case("sdf/frames in a circle", upload(chain + "<frame name='m5000'><pose relative_to='m0'/></frame>"), "read")
+    yield Case(
+        "sdf/attached in a circle", upload("<frame name='a' attached_to='b'/><frame name='b' attached_to='a'/>"), "read"
+    )
+    again = "<include><uri>model://{}</uri></include>"
+    yield Case("sdf/includes itself", upload(again.format("x"), {"x/model.sdf": model(again.format("x"))}), "refused")
+    ring = {f"x{k}/model.sdf": model(again.format(f"x{(k + 1) % 20}")) for k in range(20)}
+    yield Case("sdf/includes in a ring", upload(again.format("x0"), ring), "refused")
+    yield Case("sdf/ring without a world", ring, "refused")
+    line = {f"x{k}/model.sdf": model(again.format(f"x{k + 1}")) for k in range(100)}
+    yield Case("sdf/includes in a long line", upload(again.format("x0"), line), "refused")
+    tenfold = "".join(f"<include><name>n{j}</name><uri>model://x{{k}}</uri></include>" for j in range(10))
+    bomb = {f"x{k}/model.sdf": model(tenfold.replace("{k}", str(k + 1))) for k in range(12)}
+    ball = (
+        "<link name='l'><collision name='c'><geometry><sphere><radius>1</radius></sphere></geometry></collision></link>"
+    )
+    yield Case("sdf/include bomb", upload(again.format("x0"), {**bomb, "x12/model.sdf": model(ball)}), "refused")
+    yield Case(
+        "sdf/include bomb of links",
+        upload(again.format("x0"), {**bomb, "x12/model.sdf": model("<link name='l'/>")}),
+        "any",
+    )
+    paths = (
+        "file:///etc/passwd", "model://../../../etc/passwd", "../../../etc/passwd", "model://x/../../etc/passwd",
+        "http://127.0.0.1:1/x", "https://example.org/x", "fuel://x", "package://x/y", "model://%2e%2e/x", "model://~/x",
+        "model://x\\y", "model:////x", "model://" + "a/" * 3000, "model://\u202ex", "$(touch /tmp/evil)", "C:\\x",
+    )  # fmt: skip
+    for k, path in enumerate(paths):
+        yield Case(f"sdf/path {k}", upload(again.format(path) + body(f"<mesh><uri>{path}</uri></mesh>")), "read")
+    config = b"<model><sdf version='1.6'>../../secret/model.sdf</sdf><sdf version='1.7'>/etc/passwd</sdf></model>"
+    outside = {"x/model.config": config, "secret/model.sdf": model(""), "x/model.sdf": model("")}
+    yield Case("sdf/config that leaves its folder", upload(again.format("x"), outside), "read")
+    yield Case(
+        "sdf/broken model",
+        upload(again.format("x"), {"x/model.sdf": b"<sdf version='1.7'><model name='m'>"}),
+        "refused",
+    )
+    yield Case("sdf/model that is none", upload(again.format("x"), {"x/model.sdf": bytes(range(256))}), "read")
+    entity = b"<!DOCTYPE a [<!ENTITY b 'c'>]>" + model("&b;")
+    yield Case("sdf/model with an entity", upload(again.format("x"), {"x/model.sdf": entity}), "any")
+    for kind in ("stl", "obj", "dae", "ply", "fbx"):
+        mesh = body(f"<mesh><uri>model://m.{kind}</uri></mesh>")
+        for name, data in {
+            "noise": random.Random(3).randbytes(5000),
+            "count": b"\0" * 80 + struct.pack("<I", 2**32 - 1) + bytes(500),
+            "text": b"solid x\nfacet normal 0 0 1\nouter loop\nvertex nan 1e999 x\n",
+            "faces": b"v 0 0 0\nf 1 2 3\nf 99999999999 -5 0\n",
+            "entity": b"<!DOCTYPE COLLADA [<!ENTITY a 'b'>]><COLLADA>&a;</COLLADA>",
+            "collada": b"<COLLADA xmlns='http://www.collada.org/2005/11/COLLADASchema' version='1.4.1'><asset><unit meter='1e300'/></asset></COLLADA>",
+        }.items():
+            yield Case(f"sdf/{kind} {name}", upload(mesh, {f"m.{kind}": data}), "read")
+    heightmap = body("<heightmap><uri>model://h.png</uri><size>1 1 1</size></heightmap>")
+    yield Case("sdf/heightmap bomb", upload(heightmap, {"h.png": png(2**31 - 1, 2**31 - 1, None)}), "any")
+    yield Case(
+        "sdf/state of strangers", upload("<state><model name='x'><pose>1 2 3 0 0 0</pose></model></state>" * 50), "read"
+    )
+    yield Case("sdf/blanks", {"a.world": b" " * 5_000_000 + b"<"}, "refused", "gazebo")
+    yield Case("sdf/comments", {"a.world": b"<!--" * 200_000}, "refused", "gazebo")
+    yield Case("sdf/open comments", {"a.world": b"<sdf version='1.7'>" + b"<!-- " * 200_000}, "refused", "gazebo")
+    yield Case("sdf/many references", upload("".join(again.format(f"x{k}") for k in range(20_000))), "read")
+    lists = {
+        "anchor": b"components:\n- {type: {object: custom, reference: t.yaml}, anchor: {position: {x: .nan}}}\n",
+        "number": b"components:\n- {type: {object: a, reference: sphere}, radius: 1e999}\n",
+        "bool": b"components:\n- {type: {object: a, reference: sphere}, radius: true}\n",
+        "itself": b"components:\n- {type: {object: custom, reference: a.yaml}}\n",
+        "rows": b"a:\n  coordinates:\n  - x: 1\n    y: {}\n  orientation: 1\n",
+    }
+    for name, data in lists.items():
+        yield Case(f"sdf/list {name}", {"a.yaml": data, "custom_models/t.yaml": data}, "refused", "gazebo")
+    inner = b"components:\n" + b"".join(b"- {type: {object: custom, reference: t%d.yaml}}\n" % k for k in range(1, 9))
+    tower = {f"custom_models/t{k}.yaml": inner.replace(b"t%d.yaml" % k, b"t0.yaml") for k in range(1, 9)}
+    yield Case("sdf/list tower", {"objects.yaml": inner, **tower, "custom_models/t0.yaml": inner}, "refused")
+
+
 ACCORDING_TO_KIND = (
     yaml_cases,
     xml_cases,
@@ -1305,6 +1428,7 @@ ACCORDING_TO_KIND = (
     folder_cases,
     network_cases,
     cloud_cases,
+    sdf_cases,
 )
 
 

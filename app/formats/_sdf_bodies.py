@@ -1,0 +1,424 @@
+"""Static Gazebo models of what no world has told of: objects with shapes, footprints and lines, and a grid's walls."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+from lxml import etree
+from numpy.typing import NDArray
+
+from app.errors import Invalid
+from app.formats import WriteContext, _sdf
+from app.model import solids
+from app.model.features import Feature
+from app.model.frame import is_writable
+from app.model.grid import UNKNOWN, OccupancyGrid
+
+PLATE = 0.02
+"""Thickness in metres of what is only drawn on the ground."""
+
+FLOOR = 0.1
+THICKNESS = 0.1
+"""Metres of a floor's slab and of a wall that tells no width."""
+
+DOOR_HEIGHT = 2.1
+POLE = (0.05, 2.0)
+"""Radius and height in metres of an obstacle of which only the place is known."""
+
+HEIGHTS: Mapping[str, float] = {"barrier": 1.2, "fence": 1.2, "hedge": 1.2, "obstacle": 1.0, "tree": 3.0, "pole": 2.0}
+"""Metres, of kinds that stand in the way and tell no height; walls and buildings have parameters."""
+
+DRAWN = frozenset({"region", "zone", "area", "door"})
+"""Kinds that are seen and not felt."""
+
+COLOURS: Mapping[str, str] = {
+    "building": "0.75 0.68 0.6 1",
+    "wall": "0.7 0.7 0.7 1",
+    "floor": "0.8 0.8 0.78 1",
+    "door": "0.5 0.35 0.2 1",
+    "region": "0.45 0.65 0.4 1",
+}
+
+LARGEST_GROUND = 1e5
+
+Rings = list[list[list[float]]]
+
+
+def slug(text: str) -> str:
+    """A name as part of a path or address."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).strip("._") or "map"
+
+
+def valid(text: str) -> str:
+    """A name that SDFormat accepts: no ``::``, no reserved ``__name__`` or ``world``, no control characters."""
+    name = "".join(c for c in text.replace("::", "_") if is_writable(c)).strip()[:200]
+    name = name.replace("::", "_")
+    if not name or name == "world" or (name.startswith("__") and name.endswith("__")):
+        name = f"object_{name.strip('_')}".rstrip("_")
+    return name
+
+
+def free_name(text: str, taken: set[str]) -> str:
+    """A valid name that nothing else has; it is taken from now on."""
+    name = base = valid(text)
+    k = 1
+    while name in taken:
+        k += 1
+        name = f"{base}_{k}"
+    taken.add(name)
+    return name
+
+
+def sun(name: str) -> etree._Element:
+    """A directional light from above."""
+    light = etree.Element("light", name=name, type="directional")
+    light.append(_sdf.pose_element((0.0, 0.0, 10.0, 0.0, 0.0, 0.0)))
+    _sdf.child(light, "cast_shadows", "true")
+    _sdf.child(light, "diffuse", "0.8 0.8 0.8 1")
+    _sdf.child(light, "specular", "0.2 0.2 0.2 1")
+    _sdf.child(light, "direction", "-0.5 0.1 -0.9")
+    return light
+
+
+class Bodies:
+    """Makes models, collects the files they need, and tells what was made up and what was left out."""
+
+    def __init__(
+        self, context: WriteContext, resources: Mapping[str, bytes], wall_height: float, building_height: float
+    ) -> None:
+        self.context, self.resources = context, resources
+        self.heights = {**HEIGHTS, "wall": wall_height, "building": building_height}
+        self.files: dict[str, bytes] = {}
+        self.newest = (1, 4)
+        self._wall_height = wall_height
+        self._filled: Counter[tuple[str, float, str]] = Counter()
+        self._lost: Counter[tuple[str, str]] = Counter()
+        self._box: list[tuple[float, float, float, float]] = []
+
+    def report(self) -> None:
+        """Declare what was filled in and dropped so far."""
+        for (what, value, why), _ in sorted(self._filled.items()):
+            self.context.fill(what, value, why)
+        for (what, why), count in sorted(self._lost.items()):
+            self.context.drop(what, count, why)
+        self._filled.clear()
+        self._lost.clear()
+
+    def model(self, one: Feature, elevation: float, taken: set[str]) -> etree._Element | None:
+        """A static model of an object in local metres, or None where it has no body. elevation: metres, its level's."""
+        said = one.properties
+        kind = str(said.get("kind"))
+        try:
+            shapes = [dict(s) for s in solids.shapes_of(said)]
+            pose = list(solids.pose_of(said))
+        except Invalid as error:
+            self._lost[f"objects of kind {kind}", error.detail[:200]] += 1
+            return None
+        if shapes:
+            shapes = self._with_files(shapes, kind)
+        else:
+            shapes, pose = self._from_geometry(one, kind, elevation)
+        if not shapes:
+            self._lost[f"objects of kind {kind}", "no solid is known: supply a height, shapes or a model"] += 1
+            return None
+        name = said.get("name")
+        name = free_name(name if isinstance(name, str) and name else one.id, taken)
+        self._measure(one.geometry)
+        return self._static(name, pose, shapes, COLOURS.get(kind), said.get("gazebo"))
+
+    def _measure(self, geometry: Any) -> None:
+        box = shapely.bounds(geometry)
+        if np.isfinite(box).all():
+            west, south, east, north = (float(v) for v in box)
+            self._box.append((west, south, east, north))
+
+    def _with_files(self, shapes: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
+        """The shapes whose words are known and whose files are there; the files go along."""
+        out = []
+        for shape in shapes:
+            if shape.get("type") not in _sdf.SHAPES:
+                self._lost[f"shapes of objects of kind {kind}", f"Gazebo knows no {str(shape.get('type'))[:40]}"] += 1
+                continue
+            if shape["type"] in ("mesh", "heightmap"):
+                file = str(shape.get("file"))
+                if file not in self.resources:
+                    self._lost[f"meshes of objects of kind {kind}", f"{file[:200]} is not stored: upload it"] += 1
+                    continue
+                place = file if file.startswith(f"{_sdf.MODELS}/") else f"{_sdf.MODELS}/{file}"
+                self.files[place] = self.resources[file]
+                shape["uri"] = "model://" + place[len(_sdf.MODELS) + 1 :]
+            if shape["type"] in ("capsule", "ellipsoid"):
+                self.newest = max(self.newest, (1, 8))
+            try:
+                _sdf.geometry_element(shape, shape.get("uri"))
+            except (LookupError, TypeError, ValueError):
+                self._lost[f"shapes of objects of kind {kind}", f"a {shape['type']} without its measures"] += 1
+                continue
+            out.append(shape)
+        return out
+
+    def _from_geometry(self, one: Feature, kind: str, elevation: float) -> tuple[list[dict[str, Any]], list[float]]:
+        """Shapes and pose of a footprint, line or point in local metres; none where no height is known."""
+        said = one.properties
+        base = elevation + _positive(said.get("base"), 0.0)
+        height = _positive(said.get("height"), 0.0)
+        size = said.get("size")
+        if not height and _is_size(size) and size is not None:
+            height = float(size[2])
+        drawn = kind in DRAWN and not height
+        if not height and kind in self.heights:
+            height = self.heights[kind]
+            self._filled[f"height of {kind}", height, "the objects tell none"] += 1
+        if kind == "floor" and not height:
+            base, height = base - FLOOR, FLOOR
+            self._filled["thickness of floor", FLOOR, "the objects tell none"] += 1
+        if kind == "door" and drawn:
+            height = DOOR_HEIGHT
+            self._filled["height of door", height, "the objects tell none; doors stand open: nothing collides"] += 1
+        if drawn and not height:
+            height = PLATE
+            self._filled[f"height of {kind}", PLATE, "drawn on the ground, nothing collides with it"] += 1
+        geometry = one.geometry
+        if shapely.is_empty(geometry) or not height:
+            return [], []
+        middle = np.round(shapely.get_coordinates(shapely.centroid(geometry))[0], 3) + 0.0
+        z = base
+        pose = said.get("pose")
+        if shapely.get_type_id(geometry) == 0 and isinstance(pose, (list, tuple)) and len(pose) == 6:
+            z = base + float(pose[2])
+        shapes: list[dict[str, Any]] = []
+        for part in shapely.get_parts(geometry):
+            flat = shapely.transform(shapely.force_2d(part), lambda at: at - middle)
+            dimension = shapely.get_dimensions(flat)
+            if dimension == 2:
+                shapes += _areas(flat, height)
+            elif dimension == 1:
+                width = _positive(said.get("width"), 0.0)
+                if not width:
+                    width = THICKNESS
+                    self._filled[f"width of {kind}", width, "the objects tell none"] += 1
+                shapes += _segments(flat, height, width)
+            elif dimension == 0:
+                shapes.append(self._post(flat, height, said))
+        if drawn:
+            for shape in shapes:
+                shape["visual"] = True
+        return shapes, [float(middle[0]), float(middle[1]), round(z, 9) + 0.0, 0.0, 0.0, 0.0]
+
+    def _post(self, point: Any, height: float, said: Mapping[str, Any]) -> dict[str, Any]:
+        """A point as a box of its size, else as a thin pole."""
+        x, y = (float(v) for v in shapely.get_coordinates(point)[0])
+        size = said.get("size")
+        pose = said.get("pose")
+        yaw = float(pose[5]) if isinstance(pose, (list, tuple)) and len(pose) == 6 else 0.0
+        if _is_size(size) and size is not None:
+            return {"type": "box", "size": [*map(float, size[:2]), height], "pose": [x, y, height / 2, 0.0, 0.0, yaw]}
+        self._filled["radius of points", POLE[0], "the objects tell none"] += 1
+        return {"type": "cylinder", "radius": POLE[0], "length": height, "pose": [x, y, height / 2, 0.0, 0.0, yaw]}
+
+    def _static(
+        self, name: str, pose: Sequence[float], shapes: Sequence[Mapping[str, Any]], colour: str | None, own: Any
+    ) -> etree._Element:
+        """A static model with a collision and a visual for each shape."""
+        model = etree.Element("model", name=name)
+        if any(pose):
+            model.append(_sdf.pose_element(pose))
+        _sdf.child(model, "static", "true")
+        link = _sdf.child(model, "link", name="link")
+        material = own.get("material") if isinstance(own, Mapping) else None
+        for k, shape in enumerate(shapes):
+            for tag in ("collision", "visual"):
+                if tag == "collision" and shape.get("visual") is True:
+                    continue
+                part = _sdf.child(link, tag, name=f"{tag}_{k}")
+                if any(shape.get("pose", ())):
+                    part.append(_sdf.pose_element(shape["pose"]))
+                part.append(_sdf.geometry_element(shape, shape.get("uri")))
+                if tag == "visual":
+                    _material(part, colour, material)
+        return model
+
+    # --- ground and walls ----------------------------------------------------------------------------------------
+    @property
+    def ground_size(self) -> list[float]:
+        """Width and depth in metres of a ground that all made objects and walls stand on, at least 100 × 100."""
+        return self._ground()[1]
+
+    def _ground(self) -> tuple[list[float], list[float]]:
+        if not self._box:
+            return [0.0, 0.0], [100.0, 100.0]
+        boxes = np.array(self._box)
+        low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
+        middle = np.round((low + high) / 2, 3) + 0.0
+        size = np.clip(np.ceil((high - low + 20.0) / 10.0) * 10.0, 100.0, LARGEST_GROUND)
+        return [float(v) for v in middle], [float(v) for v in size]
+
+    def ground(self) -> etree._Element:
+        """A plane at height 0."""
+        middle, size = self._ground()
+        shape = {"type": "plane", "normal": [0.0, 0.0, 1.0], "size": size}
+        return self._static("ground_plane", [*middle, 0.0, 0.0, 0.0, 0.0], [shape], "0.8 0.8 0.8 1", None)
+
+    def walls(self, grid: OccupancyGrid, name: str, threshold: int, elevation: float) -> etree._Element | None:
+        """A grid's occupied cells as one static model, whose mesh lies in ``models/<name>/meshes``."""
+        occupied = (grid.cells >= threshold) & (grid.cells != UNKNOWN)
+        if not occupied.any():
+            self.context.warn(f"no cell has a value of {threshold} or more: there are no walls", where=name)
+            return None
+        file = f"{name}/meshes/{name}.stl"
+        self.files[f"{_sdf.MODELS}/{file}"] = stl(extruded(occupied, grid.resolution, self._wall_height))
+        self.context.fill("height of walls", self._wall_height, "a grid tells none")
+        x, y, yaw = grid.origin
+        corners = grid.corners()
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        self._box.append((float(low[0]), float(low[1]), float(high[0]), float(high[1])))
+        shape = {"type": "mesh", "scale": [1.0, 1.0, 1.0], "uri": f"model://{file}"}
+        return self._static(name, [x, y, elevation, 0.0, 0.0, yaw], [shape], COLOURS["wall"], None)
+
+
+def _material(visual: etree._Element, colour: str | None, script: Any) -> None:
+    """The colour of a kind, or the material script that a list names."""
+    if isinstance(script, Mapping) and isinstance(script.get("name"), str):
+        material = _sdf.child(_sdf.child(visual, "material"), "script")
+        uri = script.get("uri")
+        if isinstance(uri, str):
+            _sdf.child(material, "uri", uri)
+            _sdf.child(material, "name", script["name"])
+        else:
+            _sdf.child(material, "uri", "file://media/materials/scripts/gazebo.material")
+            _sdf.child(material, "name", f"Gazebo/{script['name']}")
+    elif colour is not None:
+        material = _sdf.child(visual, "material")
+        _sdf.child(material, "ambient", colour)
+        _sdf.child(material, "diffuse", colour)
+
+
+def _positive(value: Any, otherwise: float) -> float:
+    """A number of metres; the other one where there is none. A base may be negative."""
+    good = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return float(value) if good else otherwise
+
+
+def _is_size(value: Any) -> bool:
+    return (
+        isinstance(value, (list, tuple))
+        and len(value) == 3
+        and all(isinstance(v, (int, float)) and not isinstance(v, bool) and 0.0 < v < math.inf for v in value)
+    )
+
+
+def _areas(area: Any, height: float) -> list[dict[str, Any]]:
+    """A polygon as a box where it is a rectangle, else as rings to be extruded."""
+    if shapely.area(area) <= 0.0:
+        return []
+    corners = shapely.get_coordinates(shapely.get_exterior_ring(area))[:-1]
+    if len(corners) == 4 and shapely.get_num_interior_rings(area) == 0:
+        a, b = corners[1] - corners[0], corners[2] - corners[1]
+        long, wide = float(np.hypot(*a)), float(np.hypot(*b))
+        square = abs(float(a @ b)) <= 1e-6 * long * wide
+        if square and float(np.abs(corners[0] + corners[2] - corners[1] - corners[3]).max()) <= 1e-6 * max(long, wide):
+            middle = corners.mean(axis=0)
+            yaw = math.atan2(float(a[1]), float(a[0]))
+            pose = [float(middle[0]), float(middle[1]), height / 2, 0.0, 0.0, yaw]
+            return [{"type": "box", "size": [long, wide, height], "pose": pose}]
+    if not shapely.is_valid(area):
+        area = shapely.make_valid(area)
+    out = []
+    for part in shapely.get_parts(area):
+        if shapely.get_type_id(part) == 3:
+            rings = [shapely.get_exterior_ring(part), *shapely.get_rings(part)[1:]]
+            points: Rings = [shapely.get_coordinates(ring)[:-1].tolist() for ring in rings]
+            out.append({"type": "polyline", "points": points, "height": height})
+        elif shapely.get_type_id(part) == 6:
+            out += [s for p in shapely.get_parts(part) for s in _areas(p, height)]
+    return out
+
+
+def _segments(line: Any, height: float, width: float) -> list[dict[str, Any]]:
+    """A line as a box for each segment, which overlap where they meet."""
+    at = shapely.get_coordinates(line)
+    steps = np.diff(at, axis=0)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    keep = np.flatnonzero(lengths > 1e-6)
+    closed = len(at) > 3 and bool((at[0] == at[-1]).all())
+    out = []
+    for k in keep:
+        along = steps[k] / lengths[k]
+        before = width / 2 if closed or k != keep[0] else 0.0
+        after = width / 2 if closed or k != keep[-1] else 0.0
+        middle = (at[k] + at[k + 1]) / 2 + along * (after - before) / 2
+        pose = [*(float(v) for v in middle), height / 2, 0.0, 0.0, math.atan2(float(along[1]), float(along[0]))]
+        out.append({"type": "box", "size": [float(lengths[k]) + before + after, width, height], "pose": pose})
+    return out
+
+
+# --- a grid's walls ----------------------------------------------------------------------------------------------
+def rectangles(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """The occupied cells as rectangles (first column, past the last, first row, past the last): int64 [n, 4].
+
+    Runs of a row, those of equal extent in consecutive rows joined: each cell is in exactly one.
+    """
+    rows, starts, ends = _runs(occupied)
+    order = np.lexsort((rows, ends, starts))
+    rows, starts, ends = rows[order], starts[order], ends[order]
+    new = np.ones(len(rows), bool)
+    new[1:] = (starts[1:] != starts[:-1]) | (ends[1:] != ends[:-1]) | (rows[1:] != rows[:-1] + 1)
+    first = np.flatnonzero(new)
+    last = np.append(first[1:], len(rows)) - 1
+    return np.column_stack([starts[first], ends[first], rows[first], rows[last] + 1])
+
+
+def _runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Row, first column and past the last of each run of True along the rows of [h, w]."""
+    change = np.zeros((mask.shape[0], mask.shape[1] + 1), bool)
+    change[:, 0], change[:, -1] = mask[:, 0], mask[:, -1]
+    np.not_equal(mask[:, 1:], mask[:, :-1], out=change[:, 1:-1])
+    rows, columns = np.nonzero(change)
+    return rows[::2], columns[::2], columns[1::2]
+
+
+def extruded(occupied: NDArray[np.bool_], resolution: float, height: float) -> NDArray[np.float32]:
+    """The surface of all occupied cells from 0 to this height: float32 [n, 3, 3], outward, metres from the corner of
+    cell (0, 0). Tops and bottoms are rectangles, sides the runs of cell edges between occupied and not."""
+    x0, x1, y0, y1 = rectangles(occupied).T
+    flat = np.stack([_corner(x0, y0), _corner(x1, y0), _corner(x1, y1), _corner(x0, y1)], axis=1)
+    quads = [_level(flat, 1), _level(flat[:, ::-1], 0)]
+    for turned in (False, True):
+        cells = occupied.T if turned else occupied
+        padded = np.zeros((cells.shape[0] + 2, cells.shape[1]), bool)
+        padded[1:-1] = cells
+        for mask, up in ((padded[1:] & ~padded[:-1], False), (padded[:-1] & ~padded[1:], True)):
+            line, start, end = _runs(mask)
+            a, b = (_corner(line, start), _corner(line, end)) if turned else (_corner(start, line), _corner(end, line))
+            if up != turned:
+                a, b = b, a
+            quads.append(np.concatenate([_level(np.stack([a, b], 1), 0), _level(np.stack([b, a], 1), 1)], axis=1))
+    corners = np.concatenate(quads).astype(np.float64) * np.array([resolution, resolution, height])
+    return np.asarray(corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3), np.float32)
+
+
+def _corner(x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.column_stack([x, y])
+
+
+def _level(corners: NDArray[np.int64], z: int) -> NDArray[np.int64]:
+    """[n, k, 2] as [n, k, 3] at this height."""
+    return np.concatenate([corners, np.full((*corners.shape[:2], 1), z, np.int64)], axis=2)
+
+
+def stl(triangles: NDArray[np.float32]) -> bytes:
+    """Binary STL of float32 [n, 3, 3]."""
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    out = np.zeros(len(triangles), record)
+    out["corners"] = triangles
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    out["normal"] = normal / np.where(length > 0.0, length, 1.0)
+    return b"\0" * 80 + struct.pack("<I", len(triangles)) + out.tobytes()

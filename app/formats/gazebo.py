@@ -1,0 +1,756 @@
+"""Gazebo worlds: SDFormat 1.4 to 1.11, with the models, meshes and materials they need.
+
+A file is a world (``.world``, ``.world.xml``, ``.sdf``), a lone ``model.sdf`` (a world of one model), or one of the
+lists that environment_common makes worlds from (``objects.yaml``, ``known_obstacles.yaml``; see ``_sdf_lists``).
+
+Canonical: each direct model, include and light of a world is an object of the kind ``model``, ``include`` or ``light``,
+called by its name, with its ``pose`` and, where the upload tells its solids, ``shapes``, ``size`` and a footprint in
+local metres. The rest of its element is kept as text in ``properties.gazebo.sdf``, that of the world (physics, scene,
+plugins, wind …) in ``document.gazebo.worlds``. Where a pose says more than six numbers (``relative_to``,
+``placement_frame``, an include's own pose) its text stays, with the ``pose`` it means beside it: it holds as long as
+nobody moves the object. The worlds of one upload lie in one part side by side; ``world`` says which is written.
+
+``<state>`` is not kept: what it moves is warned of and noted under ``properties.gazebo.state``. Files of models are
+kept byte for byte as resources, as ``models/NAME/…``.
+
+Frame: ``spherical_coordinates`` is the datum. Its heading is the angle from east to the world's x axis,
+counter-clockwise seen from above (libignition-math: LOCAL2 to SPHERICAL), so the datum's heading, clockwise, is its
+negative. Gazebo's frame is the tangent plane and ours a projection: 1 km from the datum they differ by millimetres.
+Latitude and longitude 0 are Gazebo's default and no place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import orjson
+import shapely
+from lxml import etree
+
+from app.errors import BadUpload, Invalid, MissingLayer, NotFound, UnreadableFile
+from app.formats import (
+    Files,
+    Format,
+    Limits,
+    Needs,
+    ReadContext,
+    WriteContext,
+    _sdf,
+    _sdf_bodies,
+    _sdf_lists,
+    _xml,
+    register,
+)
+from app.formats._choice import the_one
+from app.formats._text import DEGREES, number
+from app.model import solids
+from app.model.features import Feature, Features, features, unique_ids
+from app.model.frame import GROUND, Datum, is_writable
+from app.model.layers import Layers, PartKey, Resources
+from app.parameters import parameter
+
+NAME = "gazebo"
+MAIN = "world.sdf"
+OBJECTS = ("model", "include", "light")
+NO_WALLS = ("keepout", "speed", "nogo")
+"""Grids that are masks: they are no walls unless one is asked for by its name."""
+
+SAME_POSE = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """Which world, and what is made of objects and grids that no world has told of."""
+
+    world: str | None = parameter(
+        None, "name of the stored world's file (with or without folders); default: gazebo…, else the shortest"
+    )
+    content: Literal["auto", "world", "all"] = parameter(
+        "auto",
+        "world: the stored world as it is; all: the other formats' objects and the grid's walls with it; auto: the "
+        "world where one is stored, else all",
+    )
+    version: Literal["1.4", "1.5", "1.6", "1.7", "1.8", "1.9", "1.10", "1.11"] | None = parameter(
+        None, "SDFormat version that the file says; default: the stored world's, else 1.7"
+    )
+    georeference: bool = parameter(
+        False, "put the environment's datum in the place of spherical_coordinates 0, 0, which are Gazebo's default"
+    )
+    grid: str | None = parameter(None, "grid whose occupied cells become walls; default: map, else the only one")
+    level: str | None = parameter(None, "level of the objects and the grid; default: all, and the grid's own")
+    threshold: int = parameter(65, "cell value from which on a cell is a wall", minimum=1, maximum=100)
+    wall_height: float = parameter(2.5, "height of walls that tell none", minimum=0.01, maximum=1000.0, unit="m")
+    building_height: float = parameter(
+        6.0, "height of buildings that tell none", minimum=0.01, maximum=1000.0, unit="m"
+    )
+
+
+# --- telling -----------------------------------------------------------------------------------------------------
+def detect(name: str, data: bytes) -> bool:
+    """A root element ``<sdf>`` with a world, model or light, or a list of the generator's."""
+    if _sdf.is_sdf(data):
+        return _sdf.holds(data, b"world", b"model", b"light")
+    return _sdf_lists.detect(name, data)
+
+
+def sort(files: Files, mains: Sequence[str]) -> dict[str, list[str]]:
+    """Worlds and lists are maps of their own; a model only where there is no world in the upload and no other model
+    includes it. With each come the model folders and files that it needs, also through other models."""
+    library = _sdf.Library(files)
+    lists = [n for n in mains if not _sdf.is_sdf(files[n])]
+    worlds = [n for n in mains if _sdf.is_sdf(files[n]) and _sdf.holds(files[n], b"world")]
+    out = {name: list(_sdf.needed(library, name)) for name in worlds}
+    parts = {name: _sdf_lists.needed(library, name) for name in lists}
+    inner = {other for name, others in parts.items() for other in others if other != name}
+    for name in lists:
+        if name not in inner or not set(lists) - inner:
+            out[name] = parts[name]
+    if not out:
+        out = _lone_models(library, [n for n in mains if _sdf.is_sdf(files[n])])
+    return out
+
+
+def _lone_models(library: _sdf.Library, models: Sequence[str]) -> dict[str, list[str]]:
+    """Of an upload without a world the models that ``model.config`` chooses and no other model includes."""
+    chosen = []
+    for name in models:
+        folder = name.rpartition("/")[0]
+        config = f"{folder}/model.config" if folder else "model.config"
+        if config not in library.files or library.model_file(folder) in (name, None):
+            chosen.append(name)
+    out = {name: list(_sdf.needed(library, name)) + list(_own_folder(library, name, {})) for name in chosen}
+    inner = {other for name, others in out.items() for other in others if other != name}
+    free = {name: others for name, others in out.items() if name not in inner}
+    # Models that include each other all the way round: one of them tells what is wrong.
+    return free or dict(sorted(out.items())[:1])
+
+
+# --- reading -----------------------------------------------------------------------------------------------------
+def read(files: Files, context: ReadContext) -> Layers:
+    """The worlds of a file. Raises UnreadableFile (with file, line and element) or TooLarge."""
+    main = context.main or next(iter(files))
+    library = _sdf.Library(files)
+    if not _sdf.is_sdf(files[main]) and _sdf_lists.detect(main, files[main]):
+        return _read_list(library, main, context)
+    root = _sdf.parse(files[main], context.limits)
+    version = _sdf.version_of(root.get("version"))
+    if version is None or not (1, 4) <= version <= _sdf.NEWEST:
+        said = root.get("version")
+        context.warn(f"SDFormat version {said!r} is not one of 1.4 to 1.11: read as 1.7", line=root.sourceline)
+    served = _sdf.needed(library, main)
+    if not root.findall("world"):
+        served |= _own_folder(library, main, served)
+    reader = _Reader(_sdf.Unfolder(library, served, context), main, {served[n]: files[n] for n in served}, context)
+    worlds = root.findall("world")
+    for k, world in enumerate(worlds):
+        name = _key(main) if not k else f"{_key(main)}#{k + 1}"
+        reader.world(world, name, root.get("version", ""))
+    if not worlds:
+        alone = etree.Element("world")
+        alone.extend(list(_sdf.iter_models(root)))
+        if not len(alone):
+            raise _sdf.wrong("there is no world, model or light in it", root)
+        reader.world(alone, _key(main), root.get("version", ""), alone=True)
+    reader.unfolder.report()
+    return reader.layers()
+
+
+def _own_folder(library: _sdf.Library, main: str, served: Mapping[str, str]) -> dict[str, str]:
+    """A lone model's own folder, so that what is relative to it resolves: ``models/NAME/…``."""
+    folder = main.rpartition("/")[0]
+    if not folder:
+        return {}
+    root = folder.rpartition("/")[0]
+    if main.rpartition("/")[2] != "model.sdf" and f"{folder}/model.config" not in library.files:
+        return {}
+    inside = [n for n in library.inside(folder) if n != main and n not in served]
+    return {n: f"{_sdf.MODELS}/{n[len(root) + 1 :] if root else n}" for n in inside}
+
+
+def _key(main: str) -> str:
+    """A world's name in the store: its file's path without the ending."""
+    folder, slash, base = main.rpartition("/")
+    return folder + slash + _sdf.stem(base)
+
+
+@dataclass(slots=True)
+class _Reader:
+    """The objects and the rest of a file's worlds."""
+
+    unfolder: _sdf.Unfolder
+    main: str
+    resources: dict[str, bytes]
+    context: ReadContext
+    rows: list[tuple[str, Any, dict[str, Any]]] = field(default_factory=list)
+    worlds: dict[str, dict[str, Any]] = field(default_factory=dict)
+    datum: Datum | None = None
+
+    def layers(self) -> Layers:
+        """All of it. Objects of one name get ids of their own."""
+        ids = unique_ids(name for name, _, _ in self.rows)
+        rows = [(i, g, p) for i, (_, g, p) in zip(ids, self.rows, strict=True)]
+        level = self.context.level
+        document = {NAME: {"worlds": self.worlds}}
+        parts: dict[PartKey, Any] = {PartKey("objects", level, NAME): features(rows, "local", document)}
+        if self.resources and self.context.wants("resources"):
+            parts[PartKey("resources", level, NAME)] = Resources(self.resources)
+        return Layers(parts, self.datum)
+
+    def world(self, world: etree._Element, key: str, version: str, *, alone: bool = False) -> None:
+        """Take a world apart."""
+        found = []
+        frames = _sdf.WorldFrames(self.unfolder, self.main)
+        for element in world.iterchildren("frame"):
+            frames.add(element.get("name", ""), _sdf.pose_of(element), element.get("attached_to", ""), element)
+        for element in world.iterchildren(*OBJECTS):
+            body = self._body(element)
+            name = self._name(element, body)
+            said = _sdf.pose_of(element)
+            own = body.pose if body is not None and element.tag == "include" else None
+            back = None if body is None else _sdf.placement(element, body)
+            frames.add_model(name, said or own or _sdf.ZERO, body or _sdf.Body(), back, element)
+            found.append((element, body, name, said, own, back))
+        moved = self._state(world)
+        footprints = Footprints(self.resources, self.context)
+        seen: set[str] = set()
+        for element, body, name, said, own, back in found:
+            pose_said = said or own or _sdf.ZERO
+            simple = not pose_said.relative and back is None
+            if name in seen:
+                self.context.warn("two objects of the world have this name", line=element.sourceline, where=name[:80])
+            pose = list(pose_said.values) if simple or name in seen else _sdf.six(frames.place(name))
+            seen.add(name)
+            kept: dict[str, Any] = {"world": key}
+            if not (simple and (said.plain if said is not None else element.tag != "include")):
+                kept["pose"] = pose
+            if element.tag == "include" and not _sdf.text_of(element, "name"):
+                kept["name"] = name
+            if name in moved and not _same_pose(moved[name], pose):
+                kept["state"] = moved[name]
+            self._add(element, body, name, pose, kept, footprints)
+        self._tell_state(moved, key, {name for _, _, name, _, _, _ in found})
+        rest = etree.Element("world", dict(world.attrib))
+        for child in world:
+            if child.tag not in (*OBJECTS, "state") and isinstance(child.tag, str):
+                rest.append(child)
+        entry: dict[str, Any] = {"sdf": _sdf.compact(rest), "version": version}
+        if alone:
+            entry["alone"] = True
+        place = self._datum(rest.find("spherical_coordinates"))
+        if place is not None:
+            entry["datum"] = [place.latitude, place.longitude, place.altitude, place.heading]
+        self.worlds[key] = entry
+
+    def _body(self, element: etree._Element) -> _sdf.Body | None:
+        if element.tag == "include":
+            return self.unfolder.include(element, self.main)
+        return self.unfolder.body(element, self.main)
+
+    def _name(self, element: etree._Element, body: _sdf.Body | None) -> str:
+        """What the object is called: an include without a name like its model."""
+        name = _sdf.text_of(element, "name") if element.tag == "include" else element.get("name", "")
+        if not name:
+            reference = _sdf.text_of(element, "uri").rstrip("/")
+            name = (body.name if body is not None else "") or reference.rpartition("/")[2] or str(element.tag)
+        if len(name) > 256 or not is_writable(name):
+            raise _sdf.wrong("a name must have at most 256 characters and no control characters", element)
+        return name
+
+    def _add(
+        self,
+        element: etree._Element,
+        body: _sdf.Body | None,
+        name: str,
+        pose: list[float],
+        kept: dict[str, Any],
+        footprints: Footprints,
+    ) -> None:
+        said: dict[str, Any] = {"kind": str(element.tag), "name": name, "pose": pose}
+        shapes = body.shapes() if body is not None and body.kind == "model" else []
+        if shapes:
+            said["shapes"] = shapes
+        shape, size = footprints.of(said, name)
+        if size is not None:
+            said["size"] = size
+        if "pose" not in kept:
+            for old in element.findall("pose"):
+                element.remove(old)
+        if element.tag != "include" and "name" in element.attrib:
+            del element.attrib["name"]
+        kept["sdf"] = _sdf.compact(element)
+        said[NAME] = kept
+        self.rows.append((name, shape, said))
+
+    # what the world was saved with
+
+    def _state(self, world: etree._Element) -> dict[str, list[float]]:
+        """Poses of the models of the last ``<state>``, by name."""
+        out = {}
+        for state in world.iterchildren("state"):
+            for model in state.iterchildren("model", "light"):
+                pose = _sdf.pose_of(model)
+                if pose is not None:
+                    out[model.get("name", "")] = list(pose.values)
+            if state.find("insertions") is not None:
+                reason = "the state's <insertions> are not kept: save the world with them as models"
+                self.context.warn(reason, line=state.sourceline, where="state")
+        return out
+
+    def _tell_state(self, moved: Mapping[str, list[float]], key: str, known: set[str]) -> None:
+        off = [p["name"] for _, _, p in self.rows if p.get(NAME, {}).get("world") == key and "state" in p[NAME]]
+        if off:
+            self.context.warn(
+                f"the saved <state> moves {len(off)} of {len(known)} objects ({_some(off)}); it is not kept, the poses "
+                "of the world itself are",
+                where="state",
+            )
+        strangers = sorted(set(moved) - known)
+        if strangers:
+            self.context.warn(
+                f"the <state> names {len(strangers)} that are not there: {_some(strangers)}", where="state"
+            )
+
+    def _datum(self, said: etree._Element | None) -> Datum | None:
+        """The datum that spherical coordinates mean; None where they tell no place on earth."""
+        if said is None:
+            return None
+        surface = _sdf.text_of(said, "surface_model") or "EARTH_WGS84"
+        axes = _sdf.text_of(said, "world_frame_orientation") or "ENU"
+        if surface != "EARTH_WGS84" or axes != "ENU":
+            self.context.warn(f"a world on {surface} with axes {axes} gives no datum", line=said.sourceline)
+            return None
+        latitude, longitude, elevation, heading = (
+            _sdf.vector(said, tag, 1, (0.0,))[0]
+            for tag in ("latitude_deg", "longitude_deg", "elevation", "heading_deg")
+        )
+        if latitude == 0.0 and longitude == 0.0:
+            return None
+        if heading == 180.0:
+            reason = "heading_deg 180 is taken as it stands; worlds for old Gazebo versions used it against a bug"
+            self.context.warn(reason, line=said.sourceline, where="heading_deg")
+        turned = math.remainder(-heading, 360.0)
+        found = Datum(latitude, longitude, elevation, turned)
+        known = self.context.frame.datum if self.context.frame is not None else None
+        if known is not None and known != found:
+            self.context.warn(
+                f"its place {latitude!r}, {longitude!r} (heading {turned:g}°) is not the environment's datum "
+                f"{known.latitude!r}, {known.longitude!r} (heading {known.heading:g}°), which stays: change the "
+                "environment's datum, or the world",
+                line=said.sourceline,
+                where="spherical_coordinates",
+            )
+        elif self.datum is None:
+            self.datum = found
+        return found
+
+
+@dataclass(slots=True)
+class Footprints:
+    """Footprints and sizes of objects; those of equal shapes are worked out once."""
+
+    resources: Mapping[str, bytes]
+    context: ReadContext
+    _solid: solids.Solids | None = None
+    _flat: solids.Solids | None = None
+    _known: dict[bytes, tuple[Any, list[float] | None]] = field(default_factory=dict)
+    _told: set[str] = field(default_factory=set)
+
+    def of(self, said: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
+        """The footprint in local metres (a point where no solid is known) and the size in the object's own frame."""
+        pose = said["pose"]
+        point = shapely.Point(pose[:2])
+        if not said.get("shapes"):
+            return point, None
+        key = orjson.dumps([said["shapes"], *(pose[3:5] if any(pose[3:5]) else ())])
+        if key not in self._known:
+            self._known[key] = self._worked_out(said, name)
+        area, size = self._known[key]
+        if area is None or shapely.is_empty(area):
+            return point, size
+        c, s = math.cos(pose[5]), math.sin(pose[5])
+        turn = np.array([[c, s], [-s, c]])
+        place = np.array(pose[:2])
+        return shapely.transform(area, lambda at: np.round(at @ turn + place, 9) + 0.0), size
+
+    def _worked_out(self, said: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
+        solid = [shape for shape in said["shapes"] if not shape.get("visual")]
+        if self._solid is None or self._flat is None:
+            self._solid = solids.Solids(self.resources, planes=False, visuals=True)
+            self._flat = solids.Solids(self.resources, planes=True, visuals=True)
+        alone = {"shapes": solid or said["shapes"]}
+        tilted = {**alone, "pose": [0.0, 0.0, 0.0, *said["pose"][3:5], 0.0]}
+        try:
+            area = self._solid.footprint(tilted)
+            area = self._flat.footprint(tilted) if shapely.is_empty(area) else area
+            size = self._solid.size(alone) or self._flat.size(alone)
+        except (Invalid, UnreadableFile) as error:
+            if error.detail not in self._told:
+                self._told.add(error.detail)
+                place = error.problems[0].file if error.problems else None
+                self.context.warn(f"its solids are not known: {error.detail}"[:500], file=place, where=name[:80])
+            return None, None
+        return area, None if size is None else [round(float(v), 9) + 0.0 for v in size]
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first names of many."""
+    return ", ".join(n[:60] for n in names[:12]) + (" …" if len(names) > 12 else "")
+
+
+def _same_pose(a: Sequence[float], b: Sequence[float]) -> bool:
+    return bool(np.abs(solids.matrix(a) - solids.matrix(b)).max() <= SAME_POSE)
+
+
+def _read_list(library: _sdf.Library, main: str, context: ReadContext) -> Layers:
+    """The generator's list of objects as a world of its own."""
+    found = _sdf_lists.read(library, main, context)
+    resources = {path: library.files[name] for name, path in found.served.items()}
+    footprints = Footprints(resources, context)
+    rows = []
+    key = _key(main)
+    for name, said in found.objects:
+        shape, size = footprints.of(said, name)
+        own = {**said.get(NAME, {}), "world": key}
+        rows.append((name, shape, {**said, **({"size": size} if size else {}), NAME: own}))
+    ids = unique_ids(name for name, _, _ in rows)
+    document = {NAME: {"worlds": {key: {"list": True, **found.rest}}}}
+    objects = features([(i, g, p) for i, (_, g, p) in zip(ids, rows, strict=True)], "local", document)
+    parts: dict[PartKey, Any] = {PartKey("objects", context.level, NAME): objects}
+    if resources and context.wants("resources"):
+        parts[PartKey("resources", context.level, NAME)] = Resources(resources)
+    return Layers(parts)
+
+
+# --- writing -----------------------------------------------------------------------------------------------------
+def choose(keys: Sequence[PartKey], options: WriteOptions) -> list[PartKey]:
+    """All objects and their files, and one grid for walls: the named one, else ``map``, else the only one."""
+    kept = [k for k in keys if k.layer in ("objects", "resources") and options.level in (None, k.level)]
+    grids = [k for k in keys if k.layer == "occupancy"]
+    if options.grid is None:
+        grids = [k for k in grids if k.name not in NO_WALLS]
+        names = {k.name for k in grids}
+        if any(k.layer == "objects" for k in kept) and len(names) > 1 and "map" not in names:
+            return kept
+    if not grids and options.grid is None:
+        if not any(k.layer == "objects" for k in kept):
+            raise MissingLayer("there is nothing to build a world of: supply objects or an occupancy grid")
+        return kept
+    supply = "supply a map.yaml with its image, or objects"
+    return kept + the_one(grids, "occupancy", options.grid, options.level, what="grid", option="grid", supply=supply)
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``world.sdf`` and ``models/…``."""
+    return _Writer(layers, context, context.options).files()
+
+
+@dataclass(frozen=True, slots=True)
+class _Stored:
+    """A stored world: what it says, its objects, and where they lie."""
+
+    key: str
+    entry: Mapping[str, Any]
+    objects: list[Feature]
+
+    @property
+    def is_world(self) -> bool:
+        return "sdf" in self.entry and not self.entry.get("alone")
+
+    @property
+    def rank(self) -> tuple[Any, ...]:
+        """Worlds before models and lists; ``gazebo.world`` before others; then the shortest name."""
+        name = _sdf.stem(self.key)
+        return (
+            not self.is_world,
+            "list" in self.entry,
+            not name.startswith("gazebo"),
+            self.key.count("/"),
+            len(name),
+            self.key,
+        )
+
+
+class _Writer:
+    """One world from what is stored."""
+
+    def __init__(self, layers: Layers, context: WriteContext, options: WriteOptions) -> None:
+        self.layers, self.context, self.options = layers, context, options
+        self.resources = layers.resources()
+        self.made: list[tuple[str, etree._Element]] = []
+        self.taken: set[str] = set()
+        self.stored: list[_Stored] = []
+        self.others: list[tuple[PartKey, Features]] = []
+        self.loose: list[Feature] = []
+        self._sort()
+
+    def _sort(self) -> None:
+        for key, part in self.layers.vector("objects", self.options.level).items():
+            if key.name != NAME:
+                if len(part):
+                    self.others.append((key, part))
+                continue
+            said = part.document.get(NAME)
+            worlds = said.get("worlds") if isinstance(said, Mapping) else None
+            worlds = (
+                {str(k): w for k, w in worlds.items() if isinstance(w, Mapping)} if isinstance(worlds, Mapping) else {}
+            )
+            by_world: dict[str, list[Feature]] = {name: [] for name in worlds}
+            for one in part:
+                own = one.properties.get(NAME)
+                name = own.get("world") if isinstance(own, Mapping) else None
+                by_world.get(str(name), self.loose).append(one)
+            for name, entry in worlds.items():
+                if "sdf" in entry or by_world[name]:
+                    self.stored.append(_Stored(name, entry, by_world[name]))
+        self.stored.sort(key=lambda world: world.rank)
+
+    def _chosen(self) -> _Stored | None:
+        wanted = self.options.world
+        if wanted is not None:
+            found = [w for w in self.stored if wanted in (w.key, _sdf.stem(w.key))]
+            if not found:
+                names = ", ".join(w.key for w in self.stored) or "none"
+                raise NotFound(f"there is no world {wanted!r}; there are: {names}")
+            return found[0]
+        if len(self.stored) > 1:
+            names = ", ".join(w.key for w in self.stored[1:])
+            self.context.warn(f"written is the world {self.stored[0].key}; ask for another one with world=: {names}")
+        return self.stored[0] if self.stored else None
+
+    def files(self) -> dict[str, bytes]:
+        """The world first."""
+        chosen = self._chosen()
+        for other in self.stored:
+            if other is not chosen:
+                self.context.drop(
+                    f"objects of the world {other.key}", len(other.objects), f"ask with world={other.key}"
+                )
+        world = self._frame(chosen)
+        for one in sorted(chosen.objects if chosen is not None else [], key=lambda o: _natural(o.id)):
+            self._put_back(one)
+        bodies = _sdf_bodies.Bodies(
+            self.context, self.resources, self.options.wall_height, self.options.building_height
+        )
+        self._make(bodies, [(self.options.level or GROUND, one) for one in self.loose])
+        everything = self.options.content == "all" or (
+            self.options.content == "auto" and not (chosen is not None and chosen.is_world)
+        )
+        why = "a world is stored: ask for them with content=all"
+        if everything:
+            rows = []
+            for key, part in self.others:
+                placed = part.in_local(self.layers.frame)
+                for one, geometry in zip(part, placed, strict=True):
+                    rows.append((key.level, Feature(one.id, geometry, one.properties, "local")))
+            self._make(bodies, rows)
+        else:
+            self.context.drop("objects of other formats", sum(len(p) for _, p in self.others), why)
+        bodies.report()
+        for key, grid in self.layers.grids().items():
+            if everything or self.options.grid is not None:
+                name = _sdf_bodies.free_name(f"walls_{_sdf_bodies.slug(key.name)}", self.taken)
+                made = bodies.walls(grid, name, self.options.threshold, self.layers.elevation(key.level))
+                if made is not None:
+                    self.made.append((name, made))
+            else:
+                self.context.drop(f"walls of the grid {key.name}", 1, why)
+        if chosen is None or not chosen.is_world:
+            self._furnish(bodies)
+        self._place(world, chosen)
+        world.extend([element for _, element in sorted(self.made, key=lambda row: _natural(row[0]))])
+        return self._bundle(world, chosen, bodies)
+
+    def _frame(self, chosen: _Stored | None) -> etree._Element:
+        """The world's element with all that is no object."""
+        if chosen is not None and "sdf" in chosen.entry:
+            world = _element(str(chosen.entry["sdf"]), ("world",))
+            if world is not None:
+                if not world.get("name"):
+                    first = next((str(o.properties.get("name") or o.id) for o in chosen.objects), self.context.title)
+                    world.set("name", first)
+                for tag in ("frame", "actor", "joint", "population", "road"):
+                    self.taken.update(e.get("name", "") for e in world.iterchildren(tag))
+                return world
+            self.context.warn(f"what was kept of the world {chosen.key} cannot be read: it is left out")
+        return etree.Element("world", name=_sdf_bodies.valid(_sdf.stem(chosen.key) if chosen else self.context.title))
+
+    def _put_back(self, one: Feature) -> None:
+        """An object of the stored world as it was, under its present name and pose."""
+        own = one.properties.get(NAME, {})
+        text = own.get("sdf")
+        element = _element(text, OBJECTS) if isinstance(text, str) else None
+        if element is None:
+            if isinstance(text, str):
+                self.context.warn("its element cannot be read: made anew from its shapes", where=one.id)
+            self.loose.append(one)
+            return
+        name = one.properties.get("name")
+        name = name if isinstance(name, str) and name else one.id
+        if element.tag == "include":
+            known = element.find("name")
+            if known is not None:
+                known.text = name
+            elif own.get("name") != name:
+                known = etree.Element("name")
+                known.text = name
+                element.append(known)
+        else:
+            others = _xml.attributes(element)
+            element.attrib.clear()
+            element.attrib.update({"name": name, **others})
+        if name in self.taken:
+            self.context.warn("two objects of the world have this name, which Gazebo refuses", where=name)
+        self.taken.add(name)
+        pose = one.properties.get("pose")
+        pose = [float(v) for v in pose] if _is_pose(pose) and pose is not None else [0.0] * 6
+        if own.get("pose") is None or [float(v) for v in own["pose"]] != pose:
+            for old in element.findall("pose"):
+                element.remove(old)
+            for old in element.findall("placement_frame"):
+                element.remove(old)
+            element.attrib.pop("placement_frame", None)
+            if element.tag == "include" or any(pose):
+                element.insert(0, _sdf.pose_element(pose))
+        self.made.append((name, element))
+
+    def _make(self, bodies: _sdf_bodies.Bodies, rows: Iterable[tuple[str, Feature]]) -> None:
+        """Static models of objects that no world has told of."""
+        for level, one in sorted(rows, key=lambda row: _natural(row[1].id)):
+            made = bodies.model(one, self.layers.elevation(level), self.taken)
+            if made is not None:
+                self.made.append((made.get("name", ""), made))
+
+    def _furnish(self, bodies: _sdf_bodies.Bodies) -> None:
+        """A ground to stand on and a light, where a world is made."""
+        if "ground_plane" not in self.taken:
+            self.made.append(("ground_plane", bodies.ground()))
+            self.context.fill("ground plane", bodies.ground_size, "no world tells of the ground")
+        lit = any(e.tag == "light" or _sdf.text_of(e, "uri").lower().rstrip("/").endswith("sun") for _, e in self.made)
+        if not lit:
+            name = _sdf_bodies.free_name("sun", self.taken)
+            self.made.append((name, _sdf_bodies.sun(name)))
+            self.context.fill("sun", "directional light", "no world tells of a light")
+
+    def _place(self, world: etree._Element, chosen: _Stored | None) -> None:
+        """The datum as spherical coordinates; what the stored world says stays where it means the same."""
+        datum = self.layers.datum
+        said = world.find("spherical_coordinates")
+        if datum is None:
+            return
+        here = [datum.latitude, datum.longitude, datum.altitude, datum.heading]
+        if said is not None:
+            meant = chosen.entry.get("datum") if chosen is not None else None
+            if meant is None and not self.options.georeference:
+                reason = (
+                    "the world's spherical_coordinates are not the environment's datum: georeference=true puts it there"
+                )
+                self.context.warn(reason, where="spherical_coordinates")
+                return
+            if meant is not None and [float(v) for v in meant] == here:
+                return
+            world.remove(said)
+        place = _sdf.child(world, "spherical_coordinates")
+        _sdf.child(place, "surface_model", "EARTH_WGS84")
+        if (_sdf.version_of(self._version(chosen)) or (1, 7)) >= (1, 6):
+            _sdf.child(place, "world_frame_orientation", "ENU")
+        _sdf.child(place, "latitude_deg", number(datum.latitude, DEGREES))
+        _sdf.child(place, "longitude_deg", number(datum.longitude, DEGREES))
+        _sdf.child(place, "elevation", number(datum.altitude))
+        _sdf.child(place, "heading_deg", number(-datum.heading, DEGREES))
+
+    def _version(self, chosen: _Stored | None) -> str:
+        said = str(chosen.entry.get("version") or "") if chosen is not None else ""
+        known = said if said in _sdf.VERSIONS else None
+        if self.options.version is not None:
+            if known is not None and known != self.options.version:
+                self.context.warn(f"the world was written as SDFormat {known}: its elements are not converted")
+            return self.options.version
+        return said or "1.7"
+
+    def _bundle(self, world: etree._Element, chosen: _Stored | None, bodies: _sdf_bodies.Bodies) -> dict[str, bytes]:
+        version = self._version(chosen)
+        if bodies.newest > (_sdf.version_of(version) or (1, 7)):
+            wanted = ".".join(map(str, bodies.newest))
+            if self.options.version is None and not (chosen is not None and chosen.is_world):
+                version = wanted
+            else:
+                self.context.warn(f"some shapes need SDFormat {wanted}")
+        root = etree.Element("sdf", version=version)
+        root.append(world)
+        main = _sdf.printed(root)
+        files = {MAIN: main}
+        stored: dict[str, bytes] = {}
+        for part in self.layers.of("resources", self.options.level, NAME).values():
+            stored.update(part.files if isinstance(part, Resources) else {})
+        if chosen is not None and len(self.stored) == 1:
+            needed = dict(stored)
+        else:
+            library = _sdf.Library({**stored, MAIN: main})
+            needed = {n: stored[n] for n in _sdf.needed(library, MAIN)}
+        needed |= bodies.files
+        needed.pop(MAIN, None)
+        return files | dict(sorted(needed.items()))
+
+
+def _natural(text: str) -> tuple[tuple[int, str], ...]:
+    """A sort key by which ``pole_10`` comes after ``pole_9``."""
+    out, digits, word = [], "", ""
+    for letter in text:
+        if letter.isascii() and letter.isdigit():
+            if word:
+                out.append((0, word))
+                word = ""
+            digits += letter
+        else:
+            if digits:
+                out.append((len(digits), digits))
+                digits = ""
+            word += letter
+    out.append((len(digits), digits) if digits else (0, word))
+    return tuple(out)
+
+
+def _is_pose(value: Any) -> bool:
+    return (
+        isinstance(value, (list, tuple))
+        and len(value) == 6
+        and all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in value)
+    )
+
+
+def _element(text: str, tags: Sequence[str]) -> etree._Element | None:
+    """A kept element; None where it is none of these."""
+    try:
+        element = _xml.parse(text.encode(), Limits(), remove_blank_text=True)
+    except (BadUpload, etree.LxmlError, ValueError):
+        return None
+    return element if element.tag in tags else None
+
+
+register(
+    Format(
+        name=NAME,
+        title="Gazebo world (SDFormat)",
+        files=(MAIN,),
+        media_types=("application/xml",),
+        extensions=(".world", ".world.xml", ".sdf"),
+        carries=frozenset({"objects", "occupancy", "resources"}),
+        detect=detect,
+        sort=sort,
+        read=read,
+        write=write,
+        write_options=WriteOptions,
+        choose=choose,
+        needs=Needs(
+            one_of=(frozenset({"objects"}), frozenset({"occupancy"})),
+            anchor="local",
+            also=frozenset({"resources", "occupancy"}),
+        ),
+        family=NAME,
+        rank=10,
+    )
+)

@@ -1,0 +1,921 @@
+"""Gazebo: worlds worked out by hand, real worlds, libsdformat's own check where it is installed, grids as walls."""
+
+# ruff: noqa: E501 - lines of XML
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import shutil
+import struct
+import subprocess
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from lxml import etree
+
+from app import formats
+from app.bundle import Bundle, Hints, Known, unpack
+from app.bundle import read as read_bundle
+from app.convert import offline
+from app.errors import Ambiguous, BadUpload, MissingDatum, MissingLayer, NotFound, TooLarge, UnreadableFile
+from app.formats import Limits, WriteContext, _sdf, _sdf_bodies, gazebo, get_format
+from app.formats.gazebo import WriteOptions
+from app.model import solids
+from app.model.features import Features, features
+from app.model.frame import Datum, Level
+from app.model.grid import OccupancyGrid
+from app.model.layers import Layers, PartKey, Resources
+from app.model.meshes import read_mesh
+
+SAMPLES = Path(__file__).resolve().parents[1] / "samples" / "gazebo"
+LIMITS = Limits()
+Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
+CHECKER = shutil.which("ign")
+OBJECTS = PartKey("objects", name="gazebo")
+RESOURCES = PartKey("resources", name="gazebo")
+
+
+def folder(path: Path) -> dict[str, bytes]:
+    return {p.relative_to(path).as_posix(): p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
+
+
+def told(files: dict[str, bytes], name: str | None = None, known: Known | None = None) -> Bundle:
+    return read_bundle(unpack(files, LIMITS), Hints(name), known or Known(), LIMITS)
+
+
+def objects(bundle: Bundle) -> Features:
+    part = bundle.parts[OBJECTS]
+    assert isinstance(part, Features)
+    return part
+
+
+def resources(bundle: Bundle) -> dict[str, bytes]:
+    part = bundle.parts[RESOURCES]
+    assert isinstance(part, Resources)
+    return dict(part.files)
+
+
+def world(inner: str, version: str = "1.7", name: str = "w") -> dict[str, bytes]:
+    return {"a.world": f'<sdf version="{version}"><world name="{name}">{inner}</world></sdf>'.encode()}
+
+
+def one(inner: str, **more: Any) -> dict[str, Any]:
+    """The properties of the first object of a world."""
+    return dict(objects(told(world(inner, **more))).properties[0])
+
+
+def write(
+    parts: dict[PartKey, Any], datum: Datum | None = None, levels: Any = None, **options: Any
+) -> dict[str, bytes]:
+    return report(parts, datum, levels, **options)[0]
+
+
+def report(
+    parts: dict[PartKey, Any], datum: Datum | None = None, levels: Any = None, **options: Any
+) -> tuple[dict[str, bytes], WriteContext]:
+    context = WriteContext(title="here", options=WriteOptions(**options))
+    layers = Layers(parts, datum, levels or (Level(),))
+    files = formats.write(get_format("gazebo"), layers, context)
+    check(files)
+    return files, context
+
+
+def check(files: dict[str, bytes]) -> list[str]:
+    """What libsdformat says against a bundle but what it cannot find (nothing where it is not installed)."""
+    if CHECKER is None:
+        return []
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as at:
+        for name, data in files.items():
+            path = Path(at) / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+        answer = subprocess.run(
+            [CHECKER, "sdf", "--check", f"{at}/world.sdf"],
+            env={**os.environ, "SDF_PATH": f"{at}/models", "GZ_SIM_RESOURCE_PATH": f"{at}/models"},
+            capture_output=True, text=True, timeout=120, check=False,
+        )  # fmt: skip
+    lines = (answer.stdout + answer.stderr).splitlines()
+    errors = [
+        re.sub(r"\[/sdf.*?\]: ", "", n) for n in lines if "Error" in n and "findFile" not in n and "backward" not in n
+    ]
+    if not errors:
+        assert "Valid" in answer.stdout
+    return errors
+
+
+def tree(files: dict[str, bytes]) -> etree._Element:
+    found = etree.fromstring(files["world.sdf"]).find("world")
+    assert found is not None
+    return found
+
+
+# --- our own samples ---------------------------------------------------------------------------------------------
+def test_a_yard_worked_out_by_hand() -> None:
+    found = told(folder(SAMPLES / "yard"))
+    part = objects(found)
+    assert {(i, p["kind"]) for i, p in zip(part.ids, part.properties, strict=True)} == {
+        ("sun", "light"), ("ground_plane", "model"), ("post", "model"), ("sign", "model"), ("crate", "include"),
+        ("spare crate", "include"), ("oak", "include"), ("entrance", "model"),
+    }  # fmt: skip
+    by = {f.id: f for f in part}
+    quarter = round(math.pi / 2, 9)
+    # The sign stands 2 m along the x axis of a frame at (10, 20) that is turned by 90 degrees: north of it.
+    assert by["sign"].properties["pose"] == [10.0, 22.0, 0.0, 0.0, 0.0, quarter]
+    # Nothing of the sign collides, so what is seen of it is its solid; its board is turned once more: along x again.
+    assert by["sign"].properties["shapes"] == [
+        {"type": "box", "size": [1.0, 0.1, 0.5], "pose": [0.0, 0.0, 1.0, 0.0, 0.0, quarter], "visual": True}
+    ]
+    assert shapely.equals_exact(by["sign"].geometry.normalize(), shapely.box(9.5, 21.95, 10.5, 22.05).normalize(), 1e-9)
+    # The crate: a cube of 1 m twice as long along x, half a metre up; the include's own pose turns it to the north.
+    assert by["crate"].properties["shapes"] == [
+        {
+            "type": "mesh", "file": "models/crate/meshes/crate.stl", "scale": [2.0, 1.0, 1.0],
+            "pose": [0.0, 0.0, 0.5, 0.0, 0.0, 0.0],
+        }
+    ]  # fmt: skip
+    assert by["crate"].properties["size"] == [2.0, 1.0, 1.0]
+    assert by["crate"].geometry.bounds == pytest.approx((-3.5, -5.0, -2.5, -3.0))
+    # An include without a pose stands where its model says.
+    assert by["spare crate"].properties["pose"] == [7.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert by["oak"].geometry == shapely.Point(5, 5), "nothing is known of it but its place"
+    # The gate stands 1 m north of its model at (0, 8), its right post 4 m right of the left one.
+    assert by["entrance"].geometry.bounds == pytest.approx((-2.1, 8.9, 2.1, 9.1))
+    assert by["entrance"].geometry.area == pytest.approx(0.08)
+    assert by["ground_plane"].geometry.bounds == (-30.0, -20.0, 30.0, 20.0)
+    assert found.datum == Datum(53.2686, -0.5245, 12.5, heading=-30.0)
+    problems = [w.problem for w in found.warnings]
+    assert any("moves 1 of 8 objects (post)" in p for p in problems)
+    assert any("names 1 that are not there: ghost" in p for p in problems)
+    assert any("Oak tree is not fetched: supply" in p for p in problems)
+    assert by["post"].properties["gazebo"]["state"] == [1.0, 2.5, 0.5, 0.0, 0.0, 0.0]
+    files = folder(SAMPLES / "yard")
+    assert resources(found) == {n: d for n, d in files.items() if n.startswith("models/")}
+    assert all(use.used for use in found.files.values())
+
+
+def test_a_yard_comes_back(same: Same) -> None:
+    files = folder(SAMPLES / "yard")
+    out = offline(files, "gazebo").files
+    assert next(iter(out)) == "world.sdf"
+    assert same("gazebo", files, out) == []
+    back = tree(out)
+    assert back.find("plugin/rain") is not None
+    assert back.find("model[@name='sign']/plugin") is not None
+    assert back.find("model[@name='sign']/pose").get("relative_to") == "corner"
+    assert back.find("state") is None
+    assert back.find("gui") is not None
+    if (
+        CHECKER
+    ):  # both are the upload's own words: an address of another machine, and one that libsdformat does not know
+        gone = ("https://fuel.gazebosim.org/1.0/openrobotics/models/Oak tree", "file://models/crate")
+        assert sorted(check(out)) == sorted(f"Error Code 13: Msg: Unable to find uri[{uri}]" for uri in gone)
+
+
+def test_heading_runs_the_other_way_round() -> None:
+    """heading_deg 30 in a world: libignition-math puts a point 100 m along the world's x axis 86.603 m east and 50 m
+    north of the origin, and one along its y axis 50 m west and 86.603 m north (LOCAL2 to SPHERICAL, version 6.10)."""
+    datum = told(folder(SAMPLES / "yard")).datum
+    assert datum is not None
+    frame = Layers({}, datum).frame
+    assert frame is not None
+    north_up = Layers({}, Datum(datum.latitude, datum.longitude)).frame
+    assert north_up is not None
+    earth = frame.to_wgs84(np.array([[100.0, 0.0], [0.0, 100.0]]))
+    assert north_up.to_local(earth) == pytest.approx(np.array([[86.6025, 50.0], [-50.0, 86.6025]]), abs=1e-3)
+
+
+def test_a_place_as_libignition_math_finds_it() -> None:
+    """Latitude 53.27, longitude -0.52, heading_deg 30: (100, 0) lies at 53.2704492641, -0.5187019410 and (0, 100) at
+    53.2707781582, -0.5207494405 (libignition-math 6.10, LOCAL2 to SPHERICAL)."""
+    place = (
+        "<spherical_coordinates><latitude_deg>53.27</latitude_deg><longitude_deg>-0.52</longitude_deg>"
+        "<elevation>0</elevation><heading_deg>30</heading_deg></spherical_coordinates>"
+    )
+    datum = told(world(place + "<model name='m'><link name='l'/></model>")).datum
+    frame = Layers({}, datum).frame
+    assert frame is not None
+    earth = frame.to_wgs84(np.array([[100.0, 0.0], [0.0, 100.0]]))
+    truth = np.array([[-0.5187019410, 53.2704492641], [-0.5207494405, 53.2707781582]])
+    assert np.abs(earth - truth).max() < 1e-8
+
+
+def test_an_orchard_from_a_list() -> None:
+    found = told(folder(SAMPLES / "orchard"))
+    part = objects(found)
+    assert part.ids == ("grass", "tree", "tree#2", "shed", "barrow")
+    by = {f.id: f for f in part}
+    # The trunk stands 1 m along x of the tree's frame, which is turned by 90 degrees at (4, 3): at (4, 4).
+    x, y = by["tree"].geometry.centroid.coords[0]
+    assert (x, y) == pytest.approx((4.0, 4.0), abs=1e-6)
+    assert by["tree#2"].geometry.centroid.coords[0] == pytest.approx((-3.0, 0.0), abs=1e-6)
+    assert [s.get("visual", False) for s in by["tree"].properties["shapes"]] == [False, True], "crowns do not collide"
+    assert by["shed"].geometry.bounds == (9.0, -1.5, 11.0, 1.5)
+    assert by["grass"].properties["size"] == [30.0, 20.0, 0.0]
+    assert any("custom_models/barrow.yaml is not in the upload" in w.problem for w in found.warnings)
+    answer = offline(folder(SAMPLES / "orchard"), "gazebo")
+    assert check(answer.files) == []
+    made = tree(answer.files)
+    assert [m.get("name") for m in made.iterchildren("model")] == ["grass", "ground_plane", "shed", "tree", "tree_2"]
+    assert len(made.findall("model[@name='tree']//collision")) == 1
+    assert len(made.findall("model[@name='tree']//visual")) == 2
+    assert made.findtext("model[@name='grass']//script/name") == "Gazebo/DarkGrey"
+    assert {t["what"] for t in answer.report["template"]} == {"ground plane", "sun"}
+    assert [d["what"] for d in answer.report["dropped"]] == ["objects of kind model"]
+
+
+def test_a_lone_model_is_a_world_of_one() -> None:
+    found = told(folder(SAMPLES / "cart"))
+    (cart,) = objects(found)
+    assert cart.properties["pose"] == [2.0, 3.0, 0.0, 0.0, 0.0, 0.0]
+    assert cart.geometry.bounds == pytest.approx((1.4, 2.6, 2.6, 3.4))
+    assert cart.properties["size"] == [1.2, 0.8, 0.8]
+    assert all(use.used for use in found.files.values()), "its model.config goes along"
+    out = offline(folder(SAMPLES / "cart"), "gazebo").files
+    assert {m.get("name") for m in tree(out).iterchildren("model")} == {"cart", "ground_plane"}
+    assert check(out) == []
+
+
+# --- poses and frames --------------------------------------------------------------------------------------------
+LINK = "<link name='l'><collision name='c'><geometry><box><size>2 1 1</size></box></geometry></collision></link>"
+
+
+def test_poses_of_every_kind() -> None:
+    quarter = round(math.pi / 2, 9)
+    turned = "0 0 0.7071067811865476 0.7071067811865476"
+    for said, pose in {
+        "<pose>1 2 3 0.1 0.2 0.3</pose>": [1.0, 2.0, 3.0, 0.1, 0.2, 0.3],
+        "<pose degrees='true'>1 2 3 0 0 90</pose>": [1.0, 2.0, 3.0, 0.0, 0.0, quarter],
+        f"<pose rotation_format='quat_xyzw'>1 2 3 {turned}</pose>": [1.0, 2.0, 3.0, 0.0, 0.0, quarter],
+        "<pose>1 2</pose>": [1.0, 2.0, 0.0, 0.0, 0.0, 0.0],
+        "<pose/>": [0.0] * 6,
+        "<pose frame=''>1 0 0 0 0 0</pose>": [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    }.items():
+        assert one(f"<model name='m'>{said}{LINK}</model>")["pose"] == pytest.approx(pose, abs=1e-9), said
+    for bad in ("1 2 3 4 5 6 7", "nan 0 0 0 0 0", "1e999 0 0 0 0 0", "a b c d e f", "1_0 0 0 0 0 0", "1e8 0 0 0 0 0"):
+        with pytest.raises(UnreadableFile) as caught:
+            told(world(f"<model name='m'><pose>{bad}</pose>{LINK}</model>"))
+        assert caught.value.problems[0].file == "a.world"
+        assert caught.value.problems[0].line == 1
+    with pytest.raises(UnreadableFile):
+        told(world("<model name='m'><pose rotation_format='quat_xyzw'>0 0 0 0 0 0 0</pose></model>"))
+
+
+def test_frames_in_a_world_and_in_models() -> None:
+    found = objects(
+        told(
+            world(
+                "<model name='a'><pose>10 0 0 0 0 1.5707963267948966</pose>"
+                "<link name='l'><pose>1 0 0 0 0 0</pose></link></model>"
+                f"<model name='b'><pose relative_to='a'>2 0 0 0 0 0</pose>{LINK}</model>"
+                f"<model name='c'><pose relative_to='a::l'>2 0 0 0 0 0</pose>{LINK}</model>"
+                f"<model name='d'><pose relative_to='f'>0 0 5 0 0 0</pose>{LINK}</model>"
+                "<frame name='f' attached_to='b'><pose>0 1 0 0 0 0</pose></frame>"
+                f"<model name='e' placement_frame='l'><pose>5 5 0 0 0 0</pose>"
+                "<link name='l'><pose>1 1 0 0 0 0</pose></link></model>",
+            )
+        )
+    )
+    pose = {f.id: [round(v, 6) + 0.0 for v in f.properties["pose"][:3]] for f in found}
+    # a looks north at (10, 0); b is 2 m in front of it; a's link 1 m in front, c 2 m in front of that; f is 1 m left of
+    # b, which is west; e stands so that its link is at (5, 5).
+    assert pose == {
+        "a": [10, 0, 0], "b": [10, 2, 0], "c": [10, 3, 0], "d": [9, 2, 5], "e": [4, 4, 0],
+    }  # fmt: skip
+    inside = one(
+        "<model name='m'><link name='p'><pose>0 0 1 0 0 0</pose></link>"
+        "<link name='q'><pose relative_to='p'>0 0 1 0 0 0</pose>"
+        "<collision name='c'><pose relative_to='j'>0 0 0.5 0 0 0</pose><geometry><sphere><radius>1</radius></sphere>"
+        "</geometry></collision></link>"
+        "<joint name='j' type='fixed'><pose>3 0 0 0 0 0</pose><parent>p</parent><child>q</child></joint>"
+        "<model name='n'><pose relative_to='q'>1 0 0 0 0 0</pose><link name='l'>"
+        "<collision name='c'><geometry><sphere><radius>2</radius></sphere></geometry></collision></link></model>"
+        "</model>"
+    )
+    # q is 1 m above p, the joint stands 3 m along x in q's frame, the sphere half a metre above; n beside q.
+    assert {(s["radius"], *s["pose"][:3]) for s in inside["shapes"]} == {(1.0, 3.0, 0.0, 2.5), (2.0, 1.0, 0.0, 2.0)}
+
+
+def test_frames_that_are_not_there_or_run_in_a_circle_are_warned_of() -> None:
+    found = told(
+        world(
+            "<model name='a'><pose relative_to='b'>1 0 0 0 0 0</pose></model>"
+            "<model name='b'><pose relative_to='a'>1 0 0 0 0 0</pose></model>"
+            "<model name='c'><pose relative_to='nowhere'>1 0 0 0 0 0</pose></model>"
+        )
+    )
+    assert len(objects(found)) == 3
+    problems = " ".join(w.problem for w in found.warnings)
+    assert "circle" in problems
+    assert "'nowhere' is not known" in problems
+
+
+def test_shapes_of_every_kind() -> None:
+    def shape(inner: str) -> Any:
+        link = f"<link name='l'><collision name='c'><geometry>{inner}</geometry></collision></link>"
+        return one(f"<model name='m'>{link}</model>", version="1.11").get("shapes")
+
+    assert shape("<box><size>1 2 3</size></box>") == [{"type": "box", "size": [1, 2, 3]}]
+    assert shape("<cylinder><radius>2</radius><length>3</length></cylinder>") == [
+        {"type": "cylinder", "radius": 2, "length": 3}
+    ]
+    assert shape("<capsule><radius>2</radius><length>3</length></capsule>") == [
+        {"type": "capsule", "radius": 2, "length": 3}
+    ]
+    assert shape("<sphere><radius>2</radius></sphere>") == [{"type": "sphere", "radius": 2}]
+    assert shape("<ellipsoid><radii>1 2 3</radii></ellipsoid>") == [{"type": "ellipsoid", "radii": [1, 2, 3]}]
+    assert shape("<plane><normal>1 0 0</normal><size>4 5</size></plane>") == [
+        {"type": "plane", "normal": [1, 0, 0], "size": [4, 5]}
+    ]
+    ring = "<polyline>{}<height>2</height></polyline>"
+    outer = "".join(f"<point>{x} {y}</point>" for x, y in ((0, 0), (4, 0), (4, 4), (0, 4)))
+    inner = "".join(f"<point>{x} {y}</point>" for x, y in ((1, 1), (2, 1), (2, 2)))
+    (line,) = shape(ring.format(outer) + ring.format(inner))
+    assert line["height"] == 2
+    assert [len(r) for r in line["points"]] == [4, 3]
+    assert shape("<empty/>") is None
+    assert shape("<cone><radius>1</radius><length>2</length></cone>") is None
+    with pytest.raises(UnreadableFile, match="3 numbers"):
+        shape("<box><size>1 2</size></box>")
+
+
+def test_each_shape_is_written_as_it_was_read() -> None:
+    shapes = [
+        {"type": "box", "size": [1.0, 2.0, 3.0], "pose": [1.0, 0.0, 0.0, 0.0, 0.0, 0.5]},
+        {"type": "cylinder", "radius": 2.0, "length": 3.0},
+        {"type": "capsule", "radius": 2.0, "length": 3.0},
+        {"type": "sphere", "radius": 2.0, "visual": True},
+        {"type": "ellipsoid", "radii": [1.0, 2.0, 3.0]},
+        {"type": "plane", "normal": [0.0, 0.0, 1.0], "size": [4.0, 5.0]},
+        {"type": "polyline", "points": [[[0.0, 0.0], [4.0, 0.0], [4.0, 4.0]], [[1.0, 0.5], [2.0, 0.5], [2.0, 1.0]]], "height": 2.0},
+        {"type": "mesh", "file": "m/cube.stl", "scale": [2.0, 1.0, 1.0]},
+    ]  # fmt: skip
+    rows = [("a", shapely.Point(0, 0), {"kind": "thing", "shapes": shapes, "pose": [1.0, 2.0, 3.0, 0.0, 0.0, 0.5]})]
+    cube = (SAMPLES / "yard/models/crate/meshes/crate.stl").read_bytes()
+    parts = {
+        PartKey("objects", name="other"): features(rows, "local"),
+        PartKey("resources", name="other"): Resources({"m/cube.stl": cube}),
+    }
+    files = write(parts)
+    assert check(files) == []
+    assert files["models/m/cube.stl"] == cube
+    assert etree.fromstring(files["world.sdf"]).get("version") == "1.8", "capsules came with 1.8"
+    back = {f.id: f for f in objects(told(files))}["a"]
+    assert back.properties["pose"] == rows[0][2]["pose"]
+    assert back.properties["shapes"] == [
+        {**s, "file": "models/m/cube.stl"} if s["type"] == "mesh" else s for s in shapes if not s.get("visual")
+    ]
+
+
+# --- uploads -----------------------------------------------------------------------------------------------------
+def test_several_worlds_lie_side_by_side() -> None:
+    """Each world keeps its own objects and settings; asking for one gives nothing of the others."""
+    first = b'<sdf version="1.5"><world name="one"><gravity>0 0 -1</gravity><model name="m"><link name="l"/></model></world></sdf>'
+    second = b'<sdf version="1.6"><world name="two"><wind/><model name="m"><link name="k"/></model></world></sdf>'
+    files = {"w/short.world": first, "w/longer.world.xml": second}
+    found = told(files)
+    assert objects(found).ids == ("m", "m#2")
+    assert set(objects(found).document["gazebo"]["worlds"]) == {"w/short", "w/longer"}
+    answer = offline(files, "gazebo")
+    assert tree(answer.files).get("name") == "one"
+    assert tree(answer.files).findtext("gravity") == "0 0 -1"
+    assert [m.find("link").get("name") for m in tree(answer.files).iterchildren("model")] == ["l"]
+    assert any("longer" in w["problem"] for w in answer.report["warnings"])
+    assert answer.report["dropped"] == [
+        {"what": "objects of the world w/longer", "count": 1, "why": "ask with world=w/longer"}
+    ]
+    for name in ("longer", "w/longer"):
+        other = offline(files, "gazebo", options={"world": name}).files
+        assert tree(other).get("name") == "two"
+        assert [m.get("name") for m in tree(other).iterchildren("model")] == ["m"]
+        assert [m.find("link").get("name") for m in tree(other).iterchildren("model")] == ["k"]
+    with pytest.raises(NotFound, match="w/longer"):
+        offline(files, "gazebo", options={"world": "none"})
+
+
+def test_the_four_worlds_of_the_limo_track(shared: Path, same: Same) -> None:
+    root = shared / "data/environment_template/indoor-agilex-limo-track"
+    files = folder(root)
+    found = told(files)
+    here = "config/world/"
+    names = ["potholes", "potholes_simple", "simple", "simulation_table"]
+    assert sorted(objects(found).document["gazebo"]["worlds"]) == [here + n for n in names]
+    for name in names:
+        mine = {
+            n: d for n, d in files.items() if n.startswith(here + "custom_models/") or n == f"{here}{name}.world.xml"
+        }
+        out = offline(files, "gazebo", options={"world": name}).files
+        assert same("gazebo", mine, out) == []
+        wanted = {"simple": {"simple.stl"}}.get(name, {name})
+        assert {n.split("/")[1] for n in out if n.startswith("models/")} == wanted, "only what this world needs"
+
+
+def test_a_model_is_a_world_only_without_one() -> None:
+    model = b'<sdf version="1.6"><model name="%s">%s<link name="l"/></model></sdf>'
+    files = {"models/a/model.sdf": model % (b"a", b""), "models/b/model.sdf": model % (b"b", b"")}
+    assert set(objects(told(files)).ids) == {"a", "b"}
+    include = b"<include><uri>model://b</uri></include>"
+    assert objects(told({**files, "models/a/model.sdf": model % (b"a", include)})).ids == ("a",)
+    found = told({**files, **world("<include><uri>model://a</uri></include>")})
+    assert objects(found).ids == ("a",)
+    assert not found.files["models/b/model.sdf"].used
+    assert any(w.file == "models/b/model.sdf" for w in found.warnings)
+
+
+def test_what_belongs_to_a_world_is_nothing_else() -> None:
+    """A mesh, a texture or a list in a model's folder is no map of its own."""
+    kml = (
+        b'<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>p</name></Placemark></Document></kml>'
+    )
+    files = {
+        **world("<include><uri>model://a</uri></include>"),
+        "x/a/model.sdf": b'<sdf version="1.6"><model name="a"><link name="l"/></model></sdf>',
+        "x/a/notes.kml": kml,
+        "b.kml": kml,
+    }
+    groups, rest = formats.group(files)
+    assert {(g.format.name, g.main) for g in groups} == {("gazebo", "a.world"), ("kml", "b.kml")}
+    assert set(groups[0].files) == {"a.world", "x/a/model.sdf", "x/a/notes.kml"}
+    assert rest == []
+    assert resources(told(files))["models/a/notes.kml"] == kml
+
+
+@pytest.mark.parametrize(
+    ("uri", "file", "served"),
+    [
+        ("model://a/m.stl", "models/a/m.stl", "models/a/m.stl"),
+        ("model:///a/m.stl", "deep/down/a/m.stl", "models/a/m.stl"),
+        ("model://m.stl", "x/m.stl", "models/m.stl"),
+        ("file://models/a/m.stl", "y/models/a/m.stl", "models/a/m.stl"),
+        ("file://models/a/m.stl", "y/a/m.stl", "models/a/m.stl"),
+        ("meshes/m.stl", "meshes/m.stl", "meshes/m.stl"),
+        ("model://b/c/m.stl", "models/b/c/m.stl", "models/b/c/m.stl"),
+    ],
+)
+def test_meshes_are_found_in_the_upload(uri: str, file: str, served: str) -> None:
+    cube = (SAMPLES / "yard/models/crate/meshes/crate.stl").read_bytes()
+    mesh = f"<link name='l'><collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision></link>"
+    files = {**world(f"<model name='m'>{mesh}</model>"), file: cube}
+    found = told(files)
+    assert objects(found).properties[0]["shapes"] == [{"type": "mesh", "file": served, "scale": [1, 1, 1]}]
+    assert objects(found).geometry[0].area == pytest.approx(1.0)
+    out = offline(files, "gazebo").files
+    assert out[served] == cube
+    assert objects(told(out)).properties[0]["shapes"] == objects(found).properties[0]["shapes"]
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "https://example.org/m.stl", "file:///etc/passwd", "model://../../m.stl", "../m.stl", "/etc/passwd", "~/m.stl",
+        "model://a/%2e%2e/m.stl", "$HOME/m.stl", "a\\m.stl", "package://p/m.stl", "", "model://", "model://gone/m.stl",
+    ],
+)  # fmt: skip
+def test_nothing_else_is_looked_for(uri: str) -> None:
+    mesh = f"<link name='l'><collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision></link>"
+    files = {**world(f"<model name='m'>{mesh}</model>"), "sub/x.stl": b"x"}
+    found = told(files)
+    assert "shapes" not in objects(found).properties[0]
+    assert any("supply" in w.problem or "kept" in w.problem for w in found.warnings)
+    assert uri in offline(files, "gazebo").files["world.sdf"].decode()
+
+
+def test_includes_that_go_round_are_refused_with_the_file() -> None:
+    model = b'<sdf version="1.6"><model name="%s"><include><uri>model://%s</uri></include></model></sdf>'
+    files = {"models/a/model.sdf": model % (b"a", b"b"), "models/b/model.sdf": model % (b"b", b"a")}
+    for upload in (files, {**files, **world("<include><uri>model://a</uri></include>")}):
+        with pytest.raises(UnreadableFile, match="includes itself") as caught:
+            told(upload)
+        assert caught.value.problems[0].file
+
+
+def test_includes_that_unfold_to_very_much_are_refused() -> None:
+    files = world("<include><uri>model://m0</uri></include>")
+    for k in range(8):
+        inner = "".join(f"<include><name>n{j}</name><uri>model://m{k + 1}</uri></include>" for j in range(10))
+        files[f"m{k}/model.sdf"] = f"<sdf version='1.7'><model name='m'>{inner}</model></sdf>".encode()
+    files["m8/model.sdf"] = f"<sdf version='1.7'><model name='m'>{LINK}</model></sdf>".encode()
+    with pytest.raises(TooLarge, match="shapes"):
+        told(files)
+
+
+def test_a_broken_mesh_is_warned_of() -> None:
+    lies = b"\0" * 80 + struct.pack("<I", 2**31) + bytes(50)
+    mesh = "<link name='l'><collision name='c'><geometry><mesh><uri>model://m.stl</uri></mesh></geometry></collision></link>"
+    found = told({**world(f"<model name='m'><pose>1 2 0 0 0 0</pose>{mesh}</model>"), "m.stl": lies})
+    assert objects(found).geometry[0] == shapely.Point(1, 2)
+    assert any(w.file and w.file.endswith("m.stl") and "solids are not known" in w.problem for w in found.warnings)
+
+
+def test_zero_zero_is_no_place_and_a_known_datum_stays() -> None:
+    place = "<spherical_coordinates><latitude_deg>{}</latitude_deg><longitude_deg>{}</longitude_deg><elevation>0</elevation><heading_deg>{}</heading_deg></spherical_coordinates><model name='m'><link name='l'/></model>"
+    assert told(world(place.format(0, 0, 0))).datum is None
+    assert told(world(place.format(10, 20, 270))).datum == Datum(10, 20, heading=90.0)
+    here = Datum(10.0, 20.5)
+    found = told(world(place.format(10, 20, 0)), known=Known(here))
+    assert found.datum is None
+    assert any("not the environment's datum" in w.problem for w in found.warnings)
+    files = world(place.format(10, 20, 0))
+    parts = told(files).parts
+    assert "<longitude_deg>20.5<" in write(parts, here)["world.sdf"].decode(), "the environment's datum is written"
+    kept = write(parts, Datum(10.0, 20.0))["world.sdf"].decode()
+    assert "<longitude_deg>20<" in kept, "what means the same stays as it was"
+    default = told(world(place.format(0, 0, 0))).parts
+    out, context = report(default, here)
+    assert "<longitude_deg>0<" in out["world.sdf"].decode()
+    assert any("georeference=true" in w.problem for w in context.warnings)
+    assert "<longitude_deg>20.5<" in write(default, here, georeference=True)["world.sdf"].decode()
+    moon = "<spherical_coordinates><surface_model>MOON_SCS</surface_model><latitude_deg>1</latitude_deg></spherical_coordinates>"
+    found = told(world(moon + "<model name='m'/>"))
+    assert found.datum is None
+    assert any("MOON_SCS" in w.problem for w in found.warnings)
+
+
+def test_an_object_that_is_moved_or_renamed_is_written_so() -> None:
+    found = told(folder(SAMPLES / "yard"))
+    part = objects(found)
+    moved = {"sign": [1.0, 1.0, 0.0, 0.0, 0.0, 0.0], "spare crate": [0.0] * 6, "crate": [9.0, 9.0, 0.0, 0.0, 0.0, 0.0]}
+    names = {"crate": "box 1", "post": "pole"}
+    properties = [
+        {**p, "pose": moved.get(i, p["pose"]), "name": names.get(i, p["name"])}
+        for i, p in zip(part.ids, part.properties, strict=True)
+    ]
+    parts = {**found.parts, OBJECTS: Features(part.ids, part.geometry, tuple(properties), part.local, part.document)}
+    files = write(parts)
+    back = {f.properties["name"]: f.properties["pose"] for f in objects(told(files))}
+    assert back["sign"] == moved["sign"]
+    assert back["spare crate"] == moved["spare crate"], "an include's zero pose is not its model's own"
+    assert back["box 1"] == moved["crate"]
+    assert back["pole"] == [1.0, 2.0, 0.5, 0.0, 0.0, 0.0]
+
+
+# --- worlds of other things --------------------------------------------------------------------------------------
+def test_objects_of_other_formats_become_static_models() -> None:
+    square = shapely.box(0, 0, 10, 6)
+    holed = shapely.Polygon([(20, 0), (30, 0), (30, 10), (25, 12), (20, 10)], [[(24, 4), (26, 4), (26, 6), (24, 6)]])
+    rows: list[tuple[str, Any, dict[str, Any]]] = [
+        ("house", square, {"kind": "building", "name": "a::b", "height": 4.0, "base": 1.0}),
+        ("hall", holed, {"kind": "building"}),
+        ("w", shapely.LineString([(0, 20), (5, 20), (5, 25)]), {"kind": "wall", "width": 0.2}),
+        ("floor", shapely.box(0, 0, 1, 1), {"kind": "floor"}),
+        ("door", shapely.LineString([(0, 30), (1, 30)]), {"kind": "door"}),
+        ("field", shapely.Polygon([(0, 0), (1, 0), (0, 1)]), {"kind": "region"}),
+        ("poi", shapely.Point(1, 1), {"kind": "poi"}),
+        ("tree", shapely.Point(3, 4), {"kind": "tree"}),
+        ("bin", shapely.Point(7, 7), {"kind": "bin", "size": [0.5, 0.6, 1.0]}),
+        ("nothing", None, {"kind": "building"}),
+    ]
+    parts = {PartKey("objects", name="osm", level="L2"): features(rows, "local")}
+    files, context = report(parts, None, (Level(), Level("L2", 3.0)), wall_height=2.0, building_height=5.0)
+    assert check(files) == []
+    by = {f.properties["name"]: f for f in objects(told(files))}
+    assert set(by) == {"a_b", "hall", "w", "floor", "door", "field", "tree", "bin", "ground_plane", "sun"}
+    box = solids.Solids({}, False, True)
+
+    def extent(name: str) -> Any:
+        return pytest.approx(box.bounds(by[name].properties), abs=1e-6)
+
+    assert extent("a_b") == (0, 0, 4, 10, 6, 8), "4 m high, 1 m above a floor at 3 m"
+    assert extent("hall") == (20, 0, 3, 30, 12, 8)
+    assert by["hall"].geometry.area == pytest.approx(holed.area)
+    assert extent("w") == (0, 19.9, 3, 5.1, 25, 5)
+    assert by["w"].geometry.area == pytest.approx(10 * 0.2, abs=0.03)
+    assert extent("floor") == (0, 0, 2.9, 1, 1, 3), "one stands on it"
+    assert by["door"].properties["shapes"][0]["visual"] is True
+    assert by["field"].properties["shapes"][0]["visual"] is True
+    assert extent("bin") == (6.75, 6.7, 3, 7.25, 7.3, 4)
+    filled = {(t["what"], t["value"]) for t in context.template if t["what"] != "ground plane"}
+    assert {("height of building", 5.0), ("height of wall", 2.0), ("height of tree", 3.0)} <= filled
+    assert ("sun", "directional light") in filled
+    assert {d["what"] for d in context.dropped} == {"objects of kind poi", "objects of kind building"}
+    assert write(parts, None, (Level(), Level("L2", 3.0)), wall_height=2.0, building_height=5.0) == files
+
+
+def test_places_on_earth_are_brought_to_the_local_frame() -> None:
+    datum = Datum(53.0, -0.5, heading=20.0)
+    frame = Layers({}, datum).frame
+    assert frame is not None
+    corner = frame.to_wgs84(np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 5.0], [0.0, 5.0]]))
+    parts = {PartKey("objects", name="osm"): features([("h", shapely.Polygon(corner), {"kind": "building"})], "wgs84")}
+    files = write(parts, datum)
+    assert check(files) == []
+    by = {f.id: f for f in objects(told(files))}
+    assert by["h"].geometry.bounds == pytest.approx((0, 0, 10, 5), abs=1e-6)
+    assert told(files).datum == datum
+    with pytest.raises(MissingDatum):
+        write(parts)
+
+
+def test_a_stored_world_stands_alone_unless_all_is_asked_for() -> None:
+    parts: dict[PartKey, Any] = dict(told(world("<model name='m'><link name='l'/></model>")).parts)
+    parts[PartKey("objects", name="osm")] = features([("h", shapely.box(0, 0, 1, 1), {"kind": "building"})], "local")
+    parts[PartKey("occupancy")] = OccupancyGrid(np.full((2, 2), 100, np.uint8), 0.5)
+    files, context = report(parts)
+    assert [m.get("name") for m in tree(files).iter("model")] == ["m"]
+    assert {d["what"]: d["count"] for d in context.dropped} == {
+        "objects of other formats": 1,
+        "walls of the grid map": 1,
+    }
+    everything = tree(write(parts, content="all"))
+    assert [m.get("name") for m in everything.iter("model")] == ["h", "m", "walls_map"]
+    assert everything.find("light") is None, "the stored world's author decides on its light and ground"
+
+
+def test_walls_of_a_grid() -> None:
+    cells = np.zeros((4, 6), np.uint8)
+    cells[0, :] = 100
+    cells[1:3, 2:4] = 100
+    cells[3, 5] = 70
+    cells[3, 0] = 255
+    grid = OccupancyGrid(cells, 0.5, (10.0, 20.0, math.pi / 2))
+    files, context = report({PartKey("occupancy", name="map"): grid}, wall_height=3.0)
+    assert check(files) == []
+    assert {"world.sdf", "models/walls_map/meshes/walls_map.stl"} == set(files)
+    mesh = read_mesh(files["models/walls_map/meshes/walls_map.stl"], "a.stl")
+    corners = mesh.vertices[mesh.faces]
+    volume = float(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
+    assert volume == pytest.approx(11 * 0.25 * 3.0), "closed, its faces outward: 11 cells, 3 m high"
+    walls = {f.id: f for f in objects(told(files))}["walls_map"]
+    assert walls.geometry.area == pytest.approx(11 * 0.25, abs=1e-6)
+    # The grid's x axis looks north: its 6 × 4 cells of half a metre lie west of (10, 20).
+    assert walls.geometry.bounds == pytest.approx((8.0, 20.0, 10.0, 23.0), abs=1e-6)
+    assert [t["value"] for t in context.template if t["what"] == "height of walls"] == [3.0]
+    less = write({PartKey("occupancy", name="map"): grid}, threshold=80)
+    assert len(less["models/walls_map/meshes/walls_map.stl"]) < len(files["models/walls_map/meshes/walls_map.stl"])
+    free = OccupancyGrid(np.zeros((3, 3), np.uint8), 0.5)
+    empty, context = report({PartKey("occupancy", name="map"): free})
+    assert set(empty) == {"world.sdf"}
+    assert any("no walls" in w.problem for w in context.warnings)
+
+
+def test_rectangles_hold_each_cell_once() -> None:
+    dice = np.random.default_rng(5)
+    for shape, share in (((17, 23), 0.5), ((40, 8), 0.9), ((1, 9), 0.4), ((9, 1), 0.6)):
+        cells = dice.random(shape) < share
+        count = np.zeros(shape, int)
+        for x0, x1, y0, y1 in _sdf_bodies.rectangles(cells):
+            count[y0:y1, x0:x1] += 1
+        assert (count == cells).all()
+        surface = _sdf_bodies.extruded(cells, 1.0, 1.0).astype(float)
+        volume = np.einsum("ij,ij->i", surface[:, 0], np.cross(surface[:, 1], surface[:, 2])).sum() / 6
+        assert volume == pytest.approx(cells.sum())
+
+
+def test_a_large_grid_stays_handy() -> None:
+    """4000 × 4000 cells with rooms and 20 000 single cells of noise: seconds, and a mesh of some megabytes."""
+    cells = np.zeros((4000, 4000), np.uint8)
+    cells[::200, :] = cells[:, ::250] = 100
+    dice = np.random.default_rng(1)
+    cells[dice.integers(0, 4000, 20_000), dice.integers(0, 4000, 20_000)] = 100
+    surface = _sdf_bodies.extruded(cells == 100, 0.05, 2.5)
+    assert len(surface) < 500_000
+    a, b, c = surface.astype(float).transpose(1, 0, 2)
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+    assert volume == pytest.approx(int((cells == 100).sum()) * 0.05**2 * 2.5, rel=1e-4)
+
+
+def test_which_grid_and_what_is_needed() -> None:
+    keys = [PartKey("occupancy", name=n) for n in ("keepout", "lab", "map")]
+    assert [k.name for k in gazebo.choose(keys, WriteOptions())] == ["map"]
+    assert [k.name for k in gazebo.choose(keys, WriteOptions(grid="keepout"))] == ["keepout"]
+    assert [k.name for k in gazebo.choose(keys[:2], WriteOptions())] == ["lab"], "a mask is no wall"
+    with pytest.raises(MissingLayer, match="supply"):
+        gazebo.choose(keys[:1], WriteOptions())
+    rivals = [PartKey("occupancy", name=n) for n in ("a", "b")]
+    with pytest.raises(Ambiguous):
+        gazebo.choose(rivals, WriteOptions())
+    assert gazebo.choose([OBJECTS, *rivals], WriteOptions()) == [OBJECTS]
+    with pytest.raises(NotFound):
+        gazebo.choose(keys, WriteOptions(grid="none"))
+
+
+@pytest.mark.parametrize("version", ["1.4", "1.5", "1.6", "1.7", "1.8", "1.9"])
+def test_versions_that_libsdformat_takes(version: str) -> None:
+    rows = [("h", shapely.box(0, 0, 1, 1), {"kind": "building"}), ("p", shapely.Point(1, 2), {"kind": "tree"})]
+    files = write({PartKey("objects", name="osm"): features(rows, "local")}, Datum(1.0, 2.0, 3.0, 4.0), version=version)
+    assert check(files) == []
+    assert etree.fromstring(files["world.sdf"]).get("version") == version
+    assert told(files).datum == Datum(1.0, 2.0, 3.0, 4.0)
+
+
+# --- real worlds -------------------------------------------------------------------------------------------------
+def real_worlds(shared: Path) -> list[tuple[str, Path, dict[str, bytes]]]:
+    """(key in facts.json, path, the files it is uploaded with)."""
+    out = []
+    for path in sorted((shared / "data").rglob("*")):
+        if path.is_file() and path.name.endswith((".world", ".sdf", ".world.xml")) and b"<world" in path.read_bytes():
+            root = path.parent.parent if path.parent.name == "worlds" else path.parent
+            files = {
+                p.relative_to(root).as_posix(): p.read_bytes()
+                for p in sorted(root.rglob("*"))
+                if p == path
+                or (p.is_file() and not p.name.endswith((".world", ".world.xml")) and p.parent != path.parent)
+            }
+            out.append((path.relative_to(shared / "data").as_posix(), path, files))
+    return out
+
+
+def test_real_worlds_have_their_facts_and_come_back(shared: Path, facts_json: dict[str, Any], same: Same) -> None:
+    """Also: libsdformat says nothing against what is written that it does not say against the original."""
+    worlds = real_worlds(shared)
+    assert len(worlds) > 10
+    for key, path, files in worlds:
+        known = facts_json[key]["facts"]
+        found = told(files, "gazebo")
+        kinds = Counter(p["kind"] for p in objects(found).properties)
+        assert kinds["model"] == known["top_level_models"], key
+        assert kinds["include"] == known["includes"] - known["includes_inside_model"], key
+        assert kinds["light"] == known["light_count"], key
+        names = known["top_level_model_names"]
+        models = [p["name"] for p in objects(found).properties if p["kind"] == "model"]
+        assert models[: len(names)] == names
+        moved = [p for p in objects(found).properties if "state" in p["gazebo"] and p["kind"] == "model"]
+        assert len(moved) == known.get("state_pose_differs", 0), key
+        for name, text in known["poses_top_level"].items():
+            if text:
+                said = next(p for p in objects(found).properties if p["name"] == name and p["kind"] == "model")
+                assert said["pose"] == pytest.approx([float(v) for v in text.split()]), (key, name)
+        out = offline(files, "gazebo", hints=Hints("gazebo")).files
+        assert same("gazebo", files, out) == [], key
+        assert etree.fromstring(out["world.sdf"]).get("version") == known["sdf_version"]
+        again = offline(out, "gazebo").files
+        assert {n: out[n] for n in again} == again, "what only a comment names goes along, until the comment is gone"
+        base = path.relative_to(path.parent.parent if path.parent.name == "worlds" else path.parent).as_posix()
+        before = check(
+            {**{re.sub(r"^(custom_)?models/", "models/", n): d for n, d in files.items()}, "world.sdf": files[base]}
+        )
+        assert set(check(out)) <= set(before), key
+
+
+def test_real_models_have_their_shapes(shared: Path, facts_json: dict[str, Any]) -> None:
+    """Collision geometry of lone models by kind, against the independent count; meshes only where they are there."""
+    seen = 0
+    for key, entry in facts_json.items():
+        known = entry.get("facts") or {}
+        if entry["kind"] != "sdf" or known["worlds"] or known["includes"] or not known["collisions"]:
+            continue
+        path = shared / "data" / key
+        root = path.parent.parent
+        files = {p.relative_to(root).as_posix(): p.read_bytes() for p in path.parent.rglob("*") if p.is_file()}
+        name = path.relative_to(root).as_posix()
+        files = {n: d for n, d in files.items() if n == name or not n.endswith(".sdf")}
+        files.pop(f"{path.parent.name}/model.config", None)
+        (model,) = objects(told(files, "gazebo"))
+        shapes = Counter(s["type"] for s in model.properties.get("shapes", ()) if not s.get("visual"))
+        wanted = Counter(known["collision_geometry"])
+        for kind in wanted:
+            if kind != "mesh":
+                assert shapes[kind] == wanted[kind], (key, kind)
+        assert shapes["mesh"] <= wanted["mesh"]
+        seen += 1
+    assert seen > 20
+
+
+def test_collada_units_are_applied_and_the_up_axis_is_not(shared: Path, facts_json: dict[str, Any]) -> None:
+    """The walls of turtlebot3_world are Y_UP with a unit of 2.54 cm: only with the unit and without the turn are they
+    where the map has them (all of its occupied cells within 10 cm of the model's solids)."""
+    root = shared / "data/gazebo_sdf/turtlebot3_world"
+    wall = facts_json["gazebo_sdf/turtlebot3_world/models/turtlebot3_world/meshes/wall.dae"]["facts"]
+    assert (wall["unit_meter"], wall["up_axis"]) == ("0.0254", "Y_UP")
+    found = told({n: d for n, d in folder(root).items() if not n.startswith("maps/")})
+    (place,) = [f for f in objects(found) if f.id == "turtlebot3_world"]
+    assert place.properties["kind"] == "model"
+    maps = told({n: d for n, d in folder(root).items() if n.startswith("maps/")})
+    (grid,) = [p for p in maps.parts.values() if isinstance(p, OccupancyGrid)]
+    rows, columns = np.nonzero(grid.cells == 100)
+    x = grid.origin[0] + (columns + 0.5) * grid.resolution
+    y = grid.origin[1] + (rows + 0.5) * grid.resolution
+    near = shapely.contains_xy(shapely.buffer(place.geometry, 0.1), x, y)
+    assert near.mean() > 0.98
+
+
+def test_known_obstacles_are_points_in_rows(shared: Path) -> None:
+    path = shared / "data/environment_template/riseholme_park_farm_strawberry_polytunnels/config/world"
+    found = told({"known_obstacles.yaml": (path / "known_obstacles.yaml").read_bytes()})
+    part = objects(found)
+    assert part.ids[0] == "tunnel_0/row_0/0"
+    assert part.properties[0]["pose"] == pytest.approx([20.47, -11.17, 0, 0, 0, 4.86 - 2 * math.pi])
+    # They are the feet of the world's poles.
+    poles = told({"gazebo.world": (path / "gazebo.world").read_bytes()})
+    feet = {tuple(np.round(p["pose"][:2], 2)) for p in objects(poles).properties if str(p["name"]).startswith("pole_")}
+    rows = {tuple(np.round(p["pose"][:2], 2)) for p in part.properties}
+    assert len(rows & feet) > 0.9 * len(rows)
+    files = offline({"known_obstacles.yaml": (path / "known_obstacles.yaml").read_bytes()}, "gazebo").files
+    assert check(files) == []
+    assert len(tree(files).findall("model")) == len(part) + 1
+
+
+def test_the_generators_lists(shared: Path) -> None:
+    root = shared / "data/gazebo_sdf/environment_common_test_files"
+    found = told({n: (root / n).read_bytes() for n in ("objects.yaml", "models.yaml")})
+    part = objects(found)
+    assert part.ids == ("ground_plane", "item_a", "item_b", "item_c", "item_d", "item_e", "item_d#2")
+    assert part.geometry[0].bounds == (-5.0, -10.0, 5.0, 10.0)
+    assert part.properties[4]["pose"] == [-10.0, 20.0, 0.0, 0.0, 0.0, 0.0]
+    assert part.properties[4]["gazebo"]["type"] == "model_3"
+    assert found.files["models.yaml"].used
+    shelf = b'<sdf version="1.6"><model name="m"><pose>0 0 1 0 0 0</pose>' + LINK.encode() + b"</model></sdf>"
+    more = told({"objects.yaml": (root / "objects.yaml").read_bytes(), "custom_models/model_3/model.sdf": shelf})
+    by = {f.id: f for f in objects(more)}
+    assert by["item_d"].properties["shapes"] == [{"type": "box", "size": [2, 1, 1], "pose": [0, 0, 1, 0, 0, 0]}]
+    assert by["item_d"].geometry.bounds == (-11.0, 19.5, -9.0, 20.5)
+
+
+# --- detection and damage ----------------------------------------------------------------------------------------
+def test_what_is_a_world_and_what_is_not() -> None:
+    world_ = b"<sdf version='1.6'><world name='w'/></sdf>"
+    for good in (world_, b"\n \t" + world_, b"\xef\xbb\xbf" + world_, b"<?xml version='1.0'?><!-- a --> " + world_):
+        assert gazebo.detect("any", good)
+    for bad in (
+        b"",
+        b"<kml/>",
+        b"<sdf version='1.6'/>",
+        b"<sdfx><world/></sdfx>",
+        b"<sdf><!-- <world> --></sdf>",
+        b" " * 10**6,
+    ):
+        assert not gazebo.detect("a.sdf", bad)
+    for text in (
+        b"nodes: []\nedges: []\n",
+        b"models: [a]\n",
+        b"components: [a]\n",
+        b"coordinates: [1]\norientation: 1\n",
+    ):
+        assert not gazebo.detect("a.yaml", text)
+
+
+def test_empty_worlds_are_kept_and_come_back() -> None:
+    files = world("<gravity>0 0 -1.6</gravity>", name="moon base")
+    out = offline(files, "gazebo", hints=Hints("gazebo")).files
+    assert tree(out).get("name") == "moon base"
+    assert tree(out).findtext("gravity") == "0 0 -1.6"
+    assert tree(out).find("model") is None
+
+
+@pytest.mark.parametrize(
+    ("inner", "reason"),
+    [
+        ("<model name='a\x7f'/>", "name"),
+        ("<model name='" + "a" * 300 + "'/>", "name"),
+        ("<model name='m'><link name='l'><collision name='c'><geometry><polyline><point>1</point></polyline></geometry></collision></link></model>", "2 numbers"),
+        ("<spherical_coordinates><latitude_deg>91</latitude_deg></spherical_coordinates>", "latitude"),
+        ("<spherical_coordinates><latitude_deg>1 2</latitude_deg></spherical_coordinates>", "1 numbers"),
+        ("<model name='m'>" * 100 + "</model>" * 100, "nested"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_used_is_refused_with_a_reason(inner: str, reason: str) -> None:
+    with pytest.raises(BadUpload) as caught:
+        told(world(inner))
+    assert reason in caught.value.detail
+    assert caught.value.problems[0].file == "a.world"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "components: 5\ntype: x\n",
+        "components:\n- {type: {object: a, reference: sphere}, radius: x}\n",
+        "components:\n- {type: {object: a, reference: box}, size: [1, 2]}\n",
+        "components:\n- {type: sphere}\n",
+        "components:\n- {type: {reference: box}, anchor: 5}\n",
+        "models:\n- {name: a, type: b, position: {x: .inf}}\n",
+        "models:\n  a: 5\n  type: {position: 1}\n",
+        "a:\n- x\ncoordinates:\n- x: 1\norientation: left\n",
+        "components:\n- {type: {object: custom, reference: objects.yaml}}\n",
+    ],
+)
+def test_lists_that_cannot_be_used(text: str) -> None:
+    with pytest.raises(UnreadableFile) as caught:
+        told({"objects.yaml": text.encode()}, "gazebo")
+    assert caught.value.problems[0].file == "objects.yaml"
+
+
+def test_stored_text_that_was_tampered_with_is_made_anew() -> None:
+    part = objects(told(world(f"<model name='m'>{LINK}</model>")))
+    for text in ("<model", "<plugin/>", "<!DOCTYPE a><model/>", 5):
+        own = {**part.properties[0]["gazebo"], "sdf": text}
+        bad = Features(part.ids, part.geometry, ({**part.properties[0], "gazebo": own},), part.local, part.document)
+        files = write({OBJECTS: bad})
+        (model,) = tree(files).findall("model")
+        assert model.findtext("link/collision/geometry/box/size") == "2.0 1.0 1.0"
+
+
+def test_names_are_made_valid_and_unique() -> None:
+    taken: set[str] = set()
+    names = [_sdf_bodies.free_name(n, taken) for n in ("a", "a", "a::b", "__x__", "world", "\x01", "a_2")]
+    assert names == ["a", "a_2", "a_b", "object_x", "object_world", "object", "a_2_2"]
+    assert _sdf_bodies.slug("näh (1)/x") == "n_h_1_x"
+
+
+def test_a_models_file_is_chosen_by_its_config() -> None:
+    library = _sdf.Library(folder(SAMPLES / "yard"))
+    assert library.model_file("models/crate") == "models/crate/model.sdf"
+    assert library.model_file("models/none") is None
