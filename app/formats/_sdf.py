@@ -431,14 +431,18 @@ class Shape:
 
 @dataclass(slots=True)
 class Body:
-    """The solids of a model in its own frame, and the frames in it that others may name (float64 [4, 4])."""
+    """The solids of a model in its own frame, and the frames in it that others may name."""
 
     collisions: list[Shape] = field(default_factory=list)
     visuals: list[Shape] = field(default_factory=list)
-    frames: dict[str, Matrix] = field(default_factory=dict)
+    frames: _Frames | None = None
     name: str = ""
     pose: Pose | None = None
     kind: str = "model"
+
+    def frame(self, name: str) -> Matrix | None:
+        """A frame in the model (``link``, ``model::link``) as float64 [4, 4]; None where there is none."""
+        return None if self.frames is None else self.frames.find(name)
 
     def shapes(self) -> list[dict[str, Any]]:
         """What collides; of a model where nothing does, what is seen."""
@@ -498,7 +502,7 @@ class Unfolder:
             out.collisions += [Shape(s.words, at @ s.place) for s in inside.collisions]
             out.visuals += [Shape(s.words, at @ s.place) for s in inside.visuals]
             self._counted(len(inside.collisions) + len(inside.visuals), model)
-        out.frames = frames.resolved()
+        out.frames = frames
         self._depth -= 1
         return out
 
@@ -628,7 +632,7 @@ def _pair(point: etree._Element) -> list[float]:
 def placement(element: etree._Element, inside: Body) -> Matrix | None:
     """The inverse of the frame in a model that its pose is meant for (``placement_frame``), if there is one."""
     name = element.get("placement_frame") or text_of(element, "placement_frame")
-    at = inside.frames.get(name) if name else None
+    at = inside.frame(name) if name else None
     return None if at is None else np.asarray(np.linalg.inv(at), np.float64)
 
 
@@ -676,7 +680,7 @@ class _Frames:
             return np.eye(4)
         outer, _, rest = name.partition("::")
         if rest and outer in self._inner and outer not in chain:
-            found = self._inner[outer].frames.get(rest)
+            found = self._inner[outer].frame(rest)
             if found is not None:
                 return np.asarray(self.place(outer) @ found, np.float64)
         element = self._said[chain[-1]][3] if chain else None
@@ -701,13 +705,13 @@ class _Frames:
     def _relative(self, name: str) -> Matrix:
         return self.place(name) if name in self._said else self._base(name, ())
 
-    def resolved(self) -> dict[str, Matrix]:
-        """All frames, those of nested models as ``model::frame``."""
-        out = {name: self.place(name) for name in self._said}
-        for outer, body in self._inner.items():
-            if len(out) + len(body.frames) <= MOST_SHAPES:
-                out |= {f"{outer}::{name}": out[outer] @ at for name, at in body.frames.items()}
-        return out
+    def find(self, name: str) -> Matrix | None:
+        """A frame of this model or, as ``model::frame``, of one in it; None where there is none."""
+        if name in self._said:
+            return self.place(name)
+        outer, _, rest = name.partition("::")
+        inside = self._inner[outer].frame(rest) if rest and outer in self._inner else None
+        return None if inside is None else np.asarray(self.place(outer) @ inside, np.float64)
 
 
 WorldFrames = _Frames
