@@ -130,6 +130,12 @@ class Settings(BaseSettings):
         default=64 * 2**20, ge=1024, description="Largest file that is answered over Zenoh; HTTP has no such bound."
     )
 
+    manifest_seconds: float = Field(
+        default=86_400.0,
+        ge=3600,
+        description="How long a signed manifest is good; a robot asks for a new one well before.",
+    )
+
     max_upload_bytes: int = Field(
         default=_DEFAULTS.upload_bytes, ge=1, description="Largest upload: the sum of all files of one request."
     )

@@ -34,6 +34,7 @@ from app.api import (
     health,
     jobs,
     layers,
+    manifest,
     maps,
     openapi,
     problems,
@@ -43,6 +44,7 @@ from app.api import (
 )
 from app.api.access import Access
 from app.api.answers import API
+from app.api.deltas import Deltas
 from app.api.guard import Guard
 from app.api.jobs import BEAT_SECONDS, Work
 from app.api.maps import Hot, Server
@@ -58,6 +60,7 @@ from app.events.relay import Relay
 from app.ingest import Ingest
 from app.pool import Pool
 from app.sandbox import Allowed
+from app.signing import Keys
 from app.store import Store
 
 log = logging.getLogger(__name__)
@@ -122,6 +125,7 @@ def create_app(settings: Settings) -> Server:
         derivations,
         convert,
         events,
+        manifest,
         jobs,
         tokens,
     ):
@@ -238,6 +242,7 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
             insecure_no_auth=settings.insecure_no_auth,
             data_dir=settings.data_dir,
             zenoh_mode=settings.zenoh_mode,
+            manifest_seconds=int(settings.manifest_seconds),
         ),
         store=store,
         pool=pool,
@@ -248,6 +253,8 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         hot=Hot(settings.memory_cache_bytes, access, metrics, store.generation),
         intake=intake,
         metrics=metrics,
+        keys=Keys(settings.data_dir / "keys"),
+        deltas=Deltas(service.cache),
     )
 
 

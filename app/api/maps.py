@@ -25,6 +25,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from app.api import deltas
 from app.api.access import Access, Principal, Viewer
 from app.api.answers import API, Route, answer, path_of
 from app.api.caching import Unsatisfiable, byte_range, content_disposition, none_match
@@ -73,6 +74,7 @@ class Resource:
     size: int
     body: bytes | None
     path: Path | None
+    sha256: str
     generation: int
     fresh_until: float
     tally: list[int]
@@ -173,7 +175,7 @@ class Hot:
         link = f'<{report}{"?" + query if query else ""}>; rel="describedby"'.encode()
         headers = [*bare, (b"link", link), (b"x-content-type-options", b"nosniff")]
         tally = self._tallies.setdefault(route, [0, 0])
-        return Resource(wanted, recipe, etag, etag.encode(), headers, bare, 0, None, None, generation, until, tally)
+        return Resource(wanted, recipe, etag, etag.encode(), headers, bare, 0, None, None, "", generation, until, tally)
 
     def count(self) -> None:
         """Add what was answered from memory since the last call to the metrics."""
@@ -244,12 +246,23 @@ def _filled(empty: Resource, made: Made) -> Resource:
         (b"accept-ranges", b"bytes"),
         (b"content-disposition", content_disposition(file.name).encode()),
         *empty.headers,
+        (b"use-as-dictionary", _dictionary(empty.wanted).encode()),
+        (b"vary", b"accept-encoding, available-dictionary"),
     ]
     if file.size > IN_MEMORY:
-        return replace(empty, headers=headers, size=file.size, path=file.path)
+        return replace(empty, headers=headers, size=file.size, path=file.path, sha256=file.sha256)
     body = file.path.read_bytes()
     headers.insert(0, (b"content-length", str(len(body)).encode()))
-    return replace(empty, headers=headers, size=len(body), body=body)
+    return replace(empty, headers=headers, size=len(body), body=body, sha256=file.sha256)
+
+
+def _dictionary(wanted: Wanted) -> str:
+    """For which addresses this file is a dictionary: the same file of any version (RFC 9842, URL pattern)."""
+    env, name = quote(wanted.environment, safe=""), quote(wanted.format, safe="")
+    file = "/" + quote(wanted.file, safe="/") if wanted.file else ""
+    if wanted.version is None:
+        return f'match="/maps/{env}/{name}{file}"'
+    return f'match="{API}/environments/{env}/versions/*/maps/{name}{file}"'
 
 
 def _media_type(file: MadeFile) -> str:
@@ -336,7 +349,7 @@ def _reply(
             if condition is not None:
                 return None
             condition = value
-        elif name in (b"range", b"if-match"):
+        elif name in (b"range", b"if-match", b"available-dictionary"):
             return None
     who = hot.access.known(authorization)
     if who is None or not who.may_enter(found.wanted.environment):
@@ -365,6 +378,9 @@ async def download(template: str, request: Request) -> Response:
         return started(found.job)
     if none_match(request.headers.get("if-none-match"), found.etag):
         return _response(304, found.bare)
+    delta = await _delta(request, here, found)
+    if delta is not None:
+        return delta
     if found.path is not None:
         return await _from_disk(request, found)
     body = found.body or b""
@@ -374,6 +390,25 @@ async def download(template: str, request: Request) -> Response:
     if part is None:
         return _response(200, found.headers, body)
     return _response(206, _partial_headers(found, part), body[part[0] : part[1]])
+
+
+async def _delta(request: Request, here: Services, found: Resource) -> Response | None:
+    """The file as a delta to the one that the client has, if it has one that is known here."""
+    old = deltas.wanted(request.headers)
+    if old is None or "range" in request.headers or found.size > deltas.MAX_BYTES:
+        return None
+    content = found.body if found.body is not None else found.path
+    if content is None:
+        return None
+    made = await here.deltas.between(old, found.sha256, content)
+    if made is None:
+        return None
+    etag = f'{found.etag[:-1]}-dcz{old[:16]}"'.encode()
+    left = (b"content-length", b"etag", b"accept-ranges")
+    headers = [(n, v) for n, v in found.headers if n not in left]
+    headers = [(b"content-length", str(len(made)).encode()), (b"content-encoding", b"dcz"), (b"etag", etag), *headers]
+    head_only = bool(request.scope.get("state", {}).get("head"))
+    return _response(200, headers, b"" if head_only else made)
 
 
 def _response(status: int, headers: Headers, body: bytes = b"") -> Response:

@@ -114,6 +114,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("maps", "Maps in a format, converted on demand."),
             ("channels", "Which version robots drive on."),
             ("events", "Every change as it happens."),
+            ("manifest", "What a robot verifies."),
             ("transform", "Between earth and local frame."),
             ("derivations", "What is computed from what, and committing it."),
             ("formats", "What can be read, served and converted."),
@@ -249,6 +250,8 @@ def _header_parameters() -> list[dict[str, Any]]:
         "If-None-Match": "ETags that the client has.",
         "Range": "One range of bytes.",
         "If-Range": "The range holds only for this ETag.",
+        "Available-Dictionary": "`:<base64 of the SHA-256>:` of a file that the client has (RFC 9842); with "
+        "`Accept-Encoding: dcz` the answer is a delta to it.",
     }
     return [
         {"name": name, "in": "header", "description": text, "schema": {"type": "string"}}

@@ -410,6 +410,38 @@ class DerivationOut(BaseModel):
     parameters: list[dict[str, Any]]
 
 
+class KeyOut(BaseModel):
+    """A public key; bytes in base64."""
+
+    id: str
+    algorithm: Literal["Ed25519"]
+    public_key: str
+    created: datetime
+    endorsed_by: str | None = None
+    endorsement: str | None = None
+
+
+class ManifestFile(BaseModel):
+    """One file of a map."""
+
+    format: str
+    name: str
+    size: int
+    sha256: str
+
+
+class ManifestOut(BaseModel):
+    """What a robot verifies; its signature is in a header."""
+
+    environment: str
+    channel: str | None = None
+    sequence: int
+    version: int
+    root: str
+    expires: datetime
+    files: list[ManifestFile]
+
+
 class JobOut(BaseModel):
     """Work that takes long."""
 

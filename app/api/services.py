@@ -13,9 +13,11 @@ from app.convert import Maps
 from app.formats import Limits
 from app.ingest import Ingest
 from app.pool import Pool
+from app.signing import Keys
 from app.store import Store
 
 if TYPE_CHECKING:
+    from app.api.deltas import Deltas
     from app.api.jobs import Work
     from app.api.maps import Hot
     from app.api.metrics import Metrics
@@ -33,6 +35,7 @@ class ApiOptions:
     insecure_no_auth: bool = False
     data_dir: Path = Path("data")
     zenoh_mode: str = "off"
+    manifest_seconds: int = 86_400
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +52,8 @@ class Services:
     hot: Hot
     intake: Intake
     metrics: Metrics
+    keys: Keys
+    deltas: Deltas
 
 
 async def services(request: Request) -> Services:

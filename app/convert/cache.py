@@ -126,10 +126,34 @@ class Cache:
         made = self.get(key)
         if made is None:
             raise OSError(f"the cache folder {self._folder} does not keep what is written to it")
+        for file in (*made.files, *([made.archive] if made.archive else [])):
+            self._note_hash(file)
         self._total += sum(f.size for f in made.files) + (made.archive.size if made.archive else 0)
         if self._total > self._limit:
             self._make_room()
         return made
+
+    def by_hash(self, sha256: str, most: int) -> bytes | None:
+        """The content of a made file that is still here, by its SHA-256; None where it is gone or larger."""
+        try:
+            path = self._folder / self._hash_path(sha256).read_text()
+            if path.stat().st_size > most:
+                return None
+            data = path.read_bytes()
+        except OSError:
+            return None
+        return data if hashlib.sha256(data).hexdigest() == sha256 else None
+
+    def _note_hash(self, file: MadeFile) -> None:
+        path = self._hash_path(file.sha256)
+        with contextlib.suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary = path.with_suffix(f".{uuid4().hex}")
+            temporary.write_text(file.path.relative_to(self._folder).as_posix())
+            temporary.replace(path)
+
+    def _hash_path(self, sha256: str) -> Path:
+        return self._folder / "hashes" / sha256[:2] / sha256
 
     def _make_room(self) -> None:
         """Called when there is too much; other processes may be doing the same, which does no harm."""
@@ -138,9 +162,21 @@ class Cache:
         for _, size, folder in entries[:-1]:  # the newest stays, whatever its size
             if total <= self._limit:
                 break
+            for line in self._described_hashes(folder):
+                self._hash_path(line).unlink(missing_ok=True)
             shutil.rmtree(folder, ignore_errors=True)
             total -= size
         self._total = total
+
+    def _described_hashes(self, folder: Path) -> list[str]:
+        """The hashes that lead to this folder."""
+        try:
+            described = orjson.loads((folder / "map.json").read_bytes())
+            every = [*described["files"], *([described["archive"]] if described["archive"] else [])]
+            place = folder.relative_to(self._folder).as_posix() + "/"
+            return [f["sha256"] for f in every if self._hash_path(f["sha256"]).read_text().startswith(place)]
+        except (OSError, orjson.JSONDecodeError, KeyError):
+            return []
 
     def _entries(self) -> list[tuple[float, int, Path]]:
         """Each made map: when it was last used, its size, its folder."""

@@ -15,6 +15,9 @@ PREFIX = "fleetmap"
 
 JSON = "application/json"
 
+SIGNATURE = "fleetmap-signature"
+"""Header of a manifest: ``<key id>:<base64 of the Ed25519 signature over the body>``."""
+
 EventType = Literal["version.created", "channel.planned", "channel.moved", "environment.created", "environment.deleted"]
 EVENT_TYPES: tuple[EventType, ...] = get_args(EventType)
 

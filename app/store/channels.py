@@ -39,6 +39,26 @@ class Channels(Base):
             others = [_as_channel(r, r.root) for r in connection.execute(query)]
         return [Channel(LATEST, row.head, row.root, head.sequence, None, head.author, head.time), *others]
 
+    def standing(self, environment: str, ref: str | int) -> tuple[Version, int]:
+        """A version by number or channel, and the sequence of the event that brought it (the channel) there."""
+        table, version = tables.channel, tables.version
+        with self._database.snapshot() as connection:
+            row = environment_row(connection, environment)
+            if isinstance(ref, int) or ref == LATEST:
+                number = row.head if ref == LATEST else int(ref)
+                query = select(version.c.sequence).where(version.c.environment_id == row.id, version.c.number == number)
+                sequence = connection.execute(query).scalar()
+            else:
+                known = connection.execute(
+                    select(table.c.version, table.c.sequence).where(
+                        table.c.environment_id == row.id, table.c.name == ref
+                    )
+                ).one_or_none()
+                if known is None or known.version is None:
+                    raise NotFound(f"{environment} has no channel {ref!r} that stands on a version")
+                number, sequence = known.version, known.sequence
+            return read_version(connection, row, number), int(sequence or 0)
+
     def set_channel(
         self, environment: str, channel: str, version: int, *, author: str, activate_at: datetime | None = None
     ) -> Channel:

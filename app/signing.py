@@ -1,0 +1,158 @@
+"""The server's Ed25519 keys: what signs manifests, kept in a folder that only the server reads.
+
+A key is a file ``<id>.pem`` (PKCS 8); its id is the start of the SHA-256 of the raw public key. The newest one signs.
+A rotated key is vouched for by the one before it, so that a robot that pinned the old one can follow.
+"""
+
+from __future__ import annotations
+
+import base64
+import fcntl
+import hashlib
+import json
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+KEPT = 3
+"""Keys of which the public part is still told."""
+
+
+@dataclass(frozen=True, slots=True)
+class PublicKey:
+    """A key as clients see it. endorsement: by the key before it, over the raw public key."""
+
+    id: str
+    public: bytes
+    created: str
+    endorsed_by: str | None = None
+    endorsement: bytes | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON members; bytes in base64."""
+        out: dict[str, Any] = {
+            "id": self.id,
+            "algorithm": "Ed25519",
+            "public_key": base64.b64encode(self.public).decode(),
+            "created": self.created,
+        }
+        if self.endorsed_by is not None and self.endorsement is not None:
+            out["endorsed_by"] = self.endorsed_by
+            out["endorsement"] = base64.b64encode(self.endorsement).decode()
+        return out
+
+
+class Keys:
+    """The keys of a folder; made when first needed. All processes of a data folder share them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._lock = threading.Lock()
+        self._known: tuple[float, list[PublicKey], Ed25519PrivateKey] | None = None
+
+    def public(self) -> list[PublicKey]:
+        """The newest first."""
+        return self._load()[0]
+
+    def sign(self, data: bytes) -> tuple[str, bytes]:
+        """(id of the key, signature of 64 bytes)."""
+        known, private = self._load()
+        return known[0].id, private.sign(data)
+
+    def rotate(self) -> PublicKey:
+        """A new key from now on, vouched for by the old one."""
+        self._load()
+        with self._alone():
+            known, private = self._read()
+            made = self._create(known, private)
+        self._known = None
+        return made
+
+    def _load(self) -> tuple[list[PublicKey], Ed25519PrivateKey]:
+        with self._lock:
+            changed = self._changed()
+            if self._known is None or self._known[0] != changed:
+                if changed == 0.0:
+                    with self._alone():
+                        if self._changed() == 0.0:
+                            self._create([], None)
+                known, private = self._read()
+                self._known = (self._changed(), known, private)
+            return self._known[1], self._known[2]
+
+    def _changed(self) -> float:
+        try:
+            return (self._folder / "keys.json").stat().st_mtime_ns / 1.0
+        except OSError:
+            return 0.0
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with (self._folder / "lock").open("w") as handle:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+
+    def _read(self) -> tuple[list[PublicKey], Ed25519PrivateKey]:
+        lines = json.loads((self._folder / "keys.json").read_text())
+        known = [
+            PublicKey(
+                line["id"],
+                base64.b64decode(line["public_key"]),
+                line["created"],
+                line.get("endorsed_by"),
+                base64.b64decode(line["endorsement"]) if "endorsement" in line else None,
+            )
+            for line in lines
+        ]
+        data = (self._folder / f"{known[0].id}.pem").read_bytes()
+        private = serialization.load_pem_private_key(data, None)
+        if not isinstance(private, Ed25519PrivateKey):
+            raise TypeError(f"{self._folder}/{known[0].id}.pem is no Ed25519 key")
+        return known, private
+
+    def _create(self, known: list[PublicKey], old: Ed25519PrivateKey | None) -> PublicKey:
+        private = Ed25519PrivateKey.generate()
+        public = private.public_key().public_bytes_raw()
+        endorsement = old.sign(public) if old is not None else None
+        made = PublicKey(
+            key_id(public),
+            public,
+            datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+            known[0].id if known else None,
+            endorsement,
+        )
+        pem = private.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+        _write(self._folder / f"{made.id}.pem", pem)
+        kept = [made, *known][:KEPT]
+        _write(self._folder / "keys.json", json.dumps([k.as_dict() for k in kept], indent=1).encode())
+        for path in self._folder.glob("*.pem"):
+            if path.stem != made.id:
+                path.unlink()  # an old key never signs again
+        return made
+
+
+def key_id(public: bytes) -> str:
+    """The id of a raw public key."""
+    return hashlib.sha256(public).hexdigest()[:16]
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Whole or not at all, for the owner alone."""
+    temporary = path.with_suffix(f".{os.getpid()}")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    with os.fdopen(descriptor, "wb") as handle:
+        handle.write(data)
+        handle.flush()
+        os.fsync(handle.fileno())
+    temporary.replace(path)

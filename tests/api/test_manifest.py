@@ -1,0 +1,157 @@
+"""Signed manifests, and deltas of files."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+from backports import zstd
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+from tests.api import samples
+from tests.api.conftest import Api
+
+
+def keys(api: Api) -> dict[str, Ed25519PublicKey]:
+    return {
+        k["id"]: Ed25519PublicKey.from_public_bytes(base64.b64decode(k["public_key"])) for k in api.get("keys").json()
+    }
+
+
+def check(api: Api, answer: Any) -> dict[str, Any]:
+    """The manifest, its signature verified."""
+    key, _, signature = answer.headers["fleetmap-signature"].partition(":")
+    known = keys(api)[key]
+    known.verify(base64.b64decode(signature), answer.content)
+    with pytest.raises(InvalidSignature):
+        known.verify(base64.b64decode(signature), answer.content + b" ")
+    body: dict[str, Any] = answer.json()
+    return body
+
+
+def manifest(api: Api, env: str, version: str, formats: str) -> dict[str, Any]:
+    return check(api, api.get(f"environments/{env}/versions/{version}/manifest?formats={formats}"))
+
+
+def test_it_lists_what_is_served(api: Api, farm: str) -> None:
+    told = manifest(api, farm, "latest", "tmap2,occupancy_grid,kml")
+    assert (told["environment"], told["channel"], told["version"]) == (farm, "latest", 3)
+    assert told["root"] == api.get(f"environments/{farm}").json()["root"]
+    assert datetime.fromisoformat(told["expires"]) > datetime.now(UTC)
+    assert [f["name"] for f in told["files"]] == ["map.kml", "map.pgm", "map.yaml", "network.tmap2.yaml"]
+    for file in told["files"]:
+        got = api.get(f"environments/{farm}/versions/latest/maps/{file['format']}/{file['name']}").content
+        assert (file["size"], file["sha256"]) == (len(got), hashlib.sha256(got).hexdigest())
+
+
+def test_all_grids_are_listed(api: Api, farm: str) -> None:
+    api.upload(farm, samples.grid(), grid="keepout")
+    names = [f["name"] for f in manifest(api, farm, "latest", "occupancy_grid")["files"]]
+    assert {"map.yaml", "map.pgm", "keepout.yaml", "keepout.pgm"} <= set(names)
+
+
+def test_the_sequence_is_that_of_the_channels_move(api: Api, farm: str) -> None:
+    sequences = [manifest(api, farm, v, "tmap2")["sequence"] for v in ("2", "latest")]
+    assert sequences == [3, 4]
+    api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 3})
+    assert manifest(api, farm, "production", "tmap2")["sequence"] == 5
+    api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
+    back = manifest(api, farm, "production", "tmap2")
+    assert (back["sequence"], back["version"], back["channel"]) == (6, 2, "production")
+    assert "channel" not in manifest(api, farm, "2", "tmap2")
+
+
+def test_asking_again_costs_nothing(api: Api, farm: str) -> None:
+    path = f"environments/{farm}/versions/latest/manifest?formats=tmap2"
+    first = api.get(path)
+    again = api.get(path, expect=None, headers={"if-none-match": first.headers["etag"]})
+    assert again.status_code in (304, 200)  # 200 where the clock has just stepped
+    if again.status_code == 200:
+        assert again.json()["expires"] > first.json()["expires"]
+
+
+@pytest.mark.parametrize("formats", ["", "nothing", "tmap2,nothing"])
+def test_unknown_formats_are_refused(api: Api, farm: str, formats: str) -> None:
+    api.problem("GET", f"environments/{farm}/versions/latest/manifest?formats={formats}", 422)
+
+
+def test_what_cannot_be_made_says_what_to_supply(api: Api, bare: str) -> None:
+    told = api.problem("GET", f"environments/{bare}/versions/latest/manifest?formats=tmap2", 422)
+    assert "supply" in told["detail"]
+
+
+def test_a_rotated_key_is_vouched_for(api: Api, farm: str) -> None:
+    before = keys(api)
+    viewer = api.token_for("viewer")
+    assert viewer("POST", "keys").status_code == 403
+    made = api.post("keys").json()
+    old = before[made["endorsed_by"]]
+    old.verify(base64.b64decode(made["endorsement"]), base64.b64decode(made["public_key"]))
+    assert api.get("keys").json()[0]["id"] == made["id"]
+    answer = api.get(f"environments/{farm}/versions/latest/manifest?formats=tmap2")
+    assert answer.headers["fleetmap-signature"].startswith(made["id"])
+    check(api, answer)
+
+
+def offered(data: bytes) -> dict[str, str]:
+    digest = base64.b64encode(hashlib.sha256(data).digest()).decode()
+    return {"available-dictionary": f":{digest}:", "accept-encoding": "gzip, dcz"}
+
+
+def unpack(dcz: bytes, before: bytes) -> bytes:
+    assert dcz[:8] == bytes.fromhex("5e2a4d1820000000")
+    assert dcz[8:40] == hashlib.sha256(before).digest()
+    return zstd.decompress(dcz[40:], zstd_dict=zstd.ZstdDict(before, is_raw=True).as_prefix)
+
+
+def raw(api: Api, path: str, headers: dict[str, str]) -> tuple[Any, bytes]:
+    """An answer with its body as it was sent."""
+    with api.http.stream("GET", path, headers=headers) as answer:
+        return answer, b"".join(answer.iter_raw())
+
+
+def many(moved: float = 0.0) -> bytes:
+    nodes = {f"n{k}": (float(k % 50), k / 50.0) for k in range(600)} | {"n300": (7.0 + moved, 6.0)}
+    return samples.tmap2(nodes, tuple((f"n{k}", f"n{k + 1}") for k in range(599)))
+
+
+def test_a_delta_is_small_and_exact(api: Api, bare: str) -> None:
+    path = f"/maps/{bare}/tmap2/network.tmap2.yaml"
+    api.upload(bare, {"n.tmap2.yaml": many()})
+    first = api.get(path)
+    assert first.headers["use-as-dictionary"] == f'match="{path}"'
+    assert "available-dictionary" in first.headers["vary"]
+    api.upload(bare, {"n.tmap2.yaml": many(0.25)})
+    answer, body = raw(api, path, offered(first.content))
+    assert answer.headers["content-encoding"] == "dcz"
+    whole = api.get(path)
+    assert whole.content != first.content
+    assert unpack(body, first.content) == whole.content
+    assert len(body) < 500 < len(whole.content)
+    assert answer.headers["etag"] != whole.headers["etag"]
+    again, second = raw(api, path, offered(first.content))
+    assert second == body
+    assert again.headers["etag"] == answer.headers["etag"]
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"accept-encoding": "gzip, dcz", "available-dictionary": ":AAAA:"},
+        {"accept-encoding": "gzip, dcz", "available-dictionary": "x"},
+        {"accept-encoding": "gzip, dcz", "available-dictionary": f":{base64.b64encode(bytes(32)).decode()}:"},
+        {"accept-encoding": "gzip, dcz;q=0"},
+        {"accept-encoding": "gzip"},
+    ],
+)
+def test_without_a_known_dictionary_the_file_comes_whole(api: Api, farm: str, headers: dict[str, str]) -> None:
+    path = f"/maps/{farm}/tmap2/network.tmap2.yaml"
+    whole = api.get(path).content
+    answer, body = raw(api, path, {**offered(whole), **headers} if "available-dictionary" not in headers else headers)
+    assert answer.status_code == 200
+    assert "content-encoding" not in answer.headers
+    assert body == whole
