@@ -31,7 +31,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes
-from app.errors import BadUpload, Invalid, MissingDatum
+from app.errors import BadUpload, CannotConvert, Invalid, MissingDatum
 from app.model import solids
 from app.model.features import Features, Properties
 from app.model.layers import Layers
@@ -49,6 +49,9 @@ IGNORED = frozenset(
 )
 """Marks, moving things and things without a body."""
 
+SOLID = frozenset({"model", "include"})
+"""Kinds that have a body, which may be in files that nobody has supplied."""
+
 OBSTACLES: Mapping[str, float] = {
     **dict.fromkeys(("wall", "fence", "hedge", "barrier", "railing"), 0.1),
     **dict.fromkeys(("building", "obstacle", "furniture", "shelf", "rack", "table", "machine", "container"), 0.1),
@@ -58,6 +61,9 @@ OBSTACLES: Mapping[str, float] = {
 }
 """Kinds that stand in the way, and how wide a line of that kind, or a point's disc, is where nothing says: metres.
 The 0.1 m of a wall is what rmf_building_map_tools builds."""
+
+MOST_TRIANGLES = 10_000_000
+"""Of all solids of a site together: a mesh of some megabytes can stand in a world many thousand times."""
 
 LEVEL_HEIGHT = 3.0
 """Metres of a storey, where only the number of storeys is known (OpenStreetMap's simple 3D buildings)."""
@@ -179,8 +185,10 @@ class _Reader:
         self.layers, self.notes, self.known, self.doors_closed = layers, notes, known, doors_closed
         self.found: dict[int, list[Array]] = {}
         self.left: Counter[str] = Counter()
+        self.shapeless: Counter[str] = Counter()
         self.broken: list[tuple[str, str]] = []
         self.bodiless = 0
+        self.triangles = 0
 
     def read(self, part: Features, site: Site, level: str) -> None:
         """Sort a part's objects into a site."""
@@ -198,13 +206,17 @@ class _Reader:
             else:
                 width = 0.1 if kind in DOORS or kind in HOLES else _width(kind, p)
                 if width is None:
-                    self.left[kind or "without a kind"] += 1
+                    solid = kind in SOLID and not _tags(p)
+                    (self.shapeless if solid else self.left)[kind or "without a kind"] += 1
                 else:
                     rows.append(k)
                     widths.append(width)
         if not rows and not free:
             return
-        metres = shapely.force_2d(part.take([*rows, *free]).in_local(self.layers.frame))
+        try:
+            metres = shapely.force_2d(part.take([*rows, *free]).in_local(self.layers.frame))
+        except Invalid as error:  # too far from the datum
+            raise CannotConvert(error.detail, error.problems) from error
         assembled = _relations(part, rows)
         for n, (k, width) in enumerate(zip(rows, widths, strict=True)):
             p, geometry = part.properties[k], metres[n]
@@ -235,6 +247,9 @@ class _Reader:
         except (Invalid, BadUpload) as error:
             self.broken.append((i, error.detail))
             return
+        self.triangles += len(made)
+        if self.triangles > MOST_TRIANGLES:
+            raise CannotConvert(f"the solids of the objects have more than {MOST_TRIANGLES} triangles")
         if len(made):
             self.found.setdefault(id(site), []).append(made - np.array([0.0, 0.0, self.layers.elevation(level)]))
         else:
@@ -252,6 +267,10 @@ class _Reader:
         """What was left out, and why."""
         for kind, count in sorted(self.left.items()):
             self.notes.drop(f"objects {kind}", count, "nothing in a robot's way")
+        for kind, count in sorted(self.shapeless.items()):
+            self.notes.drop(
+                f"objects {kind}", count, "they say neither shapes nor a size: their files were not uploaded"
+            )
         self.notes.drop("objects", self.bodiless, "they have neither an area nor a size")
         for i, why in self.broken[:100]:
             self.notes.warn(f"left out: {why}", where=i)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,6 +24,18 @@ from app.parameters import parameter
 MOST = 2**25
 """Occupied voxels (``Limits.voxels``)."""
 
+EASY = 2**23
+"""Voxels up to which the usual resolution is kept."""
+
+RESOLUTION = 0.1
+"""Metres unless asked otherwise."""
+
+COARSER = (RESOLUTION, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+"""What is taken where a finer one would give too many voxels."""
+
+AT_ONCE = 2**22
+"""Cells of spans that are told apart at a time."""
+
 OCCUPIED = math.log(0.971 / (1.0 - 0.971))
 """Log-odds of an occupied voxel: OctoMap's upper clamping value, as a ``.bt`` is read."""
 
@@ -32,7 +44,13 @@ OCCUPIED = math.log(0.971 / (1.0 - 0.971))
 class Parameters:
     """How fine, and what of a solid."""
 
-    resolution: float = parameter(0.1, "metres an edge of the smallest voxel", minimum=1e-3, maximum=100.0, unit="m")
+    resolution: float | None = parameter(
+        None,
+        f"metres an edge of the smallest voxel; default: {RESOLUTION}, or as much coarser as a large site needs",
+        minimum=1e-3,
+        maximum=100.0,
+        unit="m",
+    )
     filled: bool = parameter(True, "whether the inside of closed solids is occupied, or only their surface")
     extrude: float = parameter(2.5, "how high footprints are that do not say it", minimum=0.0, maximum=1000.0, unit="m")
     doors: Literal["open", "closed"] = parameter("open", "whether doors let a robot through")
@@ -65,7 +83,7 @@ def objects_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> L
         notes.fill("height", parameters.extrude, f"{guessed} footprints do not say how high they are")
     corners = np.concatenate(triangles)
     owner = np.repeat(np.arange(len(triangles)), [len(one) for one in triangles])
-    made_of = _voxels(corners, owner, parameters)
+    made_of = _voxels(corners, owner, parameters, notes)
     return Layers({PartKey("voxels", GROUND, MAP): made_of}, layers.datum, layers.levels)
 
 
@@ -84,20 +102,33 @@ def _extruded(site: Site, otherwise: float) -> tuple[list[Array], int]:
     return out, without
 
 
-def _voxels(
-    corners: Array,
-    owner: NDArray[np.int64],
-    parameters: Parameters,
-) -> VoxelMap:
-    edge = parameters.resolution
+def _expected(corners: Array, owner: NDArray[np.int64], resolution: float, *, filled: bool) -> float:
+    """About how many voxels: what lies in the solids, and one for each square of their surface."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    area = float(np.linalg.norm(normal, axis=1).sum()) / 2
+    middle = corners.reshape(-1, 3).mean(axis=0)  # near it the sums of large numbers stay small
+    volume = np.abs(np.bincount(owner, np.einsum("ij,ij->i", a - middle, normal) / 6)).sum() if filled else 0.0
+    return area / resolution**2 + float(volume) / resolution**3
+
+
+def _voxels(corners: Array, owner: NDArray[np.int64], parameters: Parameters, notes: Notes) -> VoxelMap:
     flat = corners.reshape(-1, 3)
     low, high = flat.min(axis=0).tolist(), flat.max(axis=0).tolist()
-    if max(map(abs, (*low, *high))) / edge > HALF - 1:
+    edge = parameters.resolution or next(
+        (r for r in COARSER if _fits(low, high, r) and _expected(corners, owner, r, filled=parameters.filled) <= EASY),
+        COARSER[-1],
+    )
+    if parameters.resolution is None and edge != RESOLUTION:
+        notes.fill("resolution", edge, f"{RESOLUTION} m would be too many voxels")
+    if not _fits(low, high, edge):
         needed = max(map(abs, (*low, *high))) / (HALF - 1)
         raise CannotConvert(
             f"an octree reaches {HALF * edge:g} m to each side at {edge:g} m, and the objects lie further from the "
             f"origin: ask for a resolution of at least {needed:.3g} m, or set a datum nearer to them"
         )
+    if _expected(corners, owner, edge, filled=parameters.filled) > 4 * MOST:
+        _too_many(edge)
     frame = Frame.around((low[0], low[1], high[0], high[1]), edge)
     first = math.floor(low[2] / edge + 1e-6)
     end = max(math.ceil(high[2] / edge - 1e-6), first + 1)
@@ -112,6 +143,10 @@ def _voxels(
     return voxels.pruned(VoxelMap(edge, depth, codes, np.full(len(codes), OCCUPIED, np.float32)))
 
 
+def _fits(low: Sequence[float], high: Sequence[float], edge: float) -> bool:
+    return bool(max(map(abs, (*low, *high))) / edge <= HALF - 1)
+
+
 def _codes(spans: Iterable[Spans], frame: Frame, first: int) -> voxels.Codes:
     """The Morton codes of all cells of spans, each once, ascending."""
     x0, y0 = (round(v / frame.resolution) for v in frame.origin)
@@ -119,19 +154,18 @@ def _codes(spans: Iterable[Spans], frame: Frame, first: int) -> voxels.Codes:
     waiting: list[voxels.Codes] = []
     size = 0
     for part in spans:
-        cells = int((part[:, 3] - part[:, 2]).sum())
-        if cells > 4 * MOST:
-            _too_many(frame)
-        layer, row, column = _raster.expanded(part)
-        waiting.append(_distinct(voxels.morton(column + x0, row + y0, layer + first)))
-        size += len(waiting[-1])
-        if size > MOST:
-            out, waiting, size = _distinct(np.concatenate([out, *waiting])), [], 0
-            if len(out) > MOST:
-                _too_many(frame)
+        portion = np.cumsum(part[:, 3] - part[:, 2]) // AT_ONCE
+        for some in np.split(part, np.flatnonzero(np.diff(portion)) + 1):
+            layer, row, column = _raster.expanded(some)
+            waiting.append(_distinct(voxels.morton(column + x0, row + y0, layer + first)))
+            size += len(waiting[-1])
+            if size > MOST:
+                out, waiting, size = _distinct(np.concatenate([out, *waiting])), [], 0
+                if len(out) > MOST:
+                    _too_many(frame.resolution)
     out = _distinct(np.concatenate([out, *waiting]))
     if len(out) > MOST:
-        _too_many(frame)
+        _too_many(frame.resolution)
     return out
 
 
@@ -143,7 +177,7 @@ def _distinct(codes: voxels.Codes) -> voxels.Codes:
     return ordered[new]
 
 
-def _too_many(frame: Frame) -> None:
+def _too_many(resolution: float) -> None:
     raise CannotConvert(
-        f"voxels of {frame.resolution:g} m would be more than {MOST}: ask for a coarser resolution, or filled=false"
+        f"voxels of {resolution:g} m would be more than {MOST}: ask for a coarser resolution, or filled=false"
     )

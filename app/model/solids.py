@@ -42,7 +42,7 @@ from app.model.frame import MAX_METRES
 
 Array = NDArray[np.float64]
 
-MOST_TRIANGLES = 20_000_000
+MOST_TRIANGLES = 5_000_000
 """Of one object."""
 
 MOST_SHAPES = 10_000
@@ -79,13 +79,16 @@ class Solids:
 
         Raises Invalid that names the file or the shape; the detail says what to supply for a missing file.
         """
-        shapes = shapes_of(properties)
-        found = [self.shape(shape, f"shapes[{k}]") for k, shape in enumerate(shapes) if self._counts(shape)]
+        found: list[Array] = []
+        total = 0
+        for k, shape in enumerate(shapes_of(properties)):
+            if self._counts(shape):
+                found.append(self.shape(shape, f"shapes[{k}]"))
+                total += len(found[-1])
+                if total > MOST_TRIANGLES:
+                    raise TooLarge(f"an object has more than {MOST_TRIANGLES} triangles")
         if not found:
             return _NOTHING
-        total = sum(map(len, found))
-        if total > MOST_TRIANGLES:
-            raise TooLarge(f"an object has {total} triangles; the limit is {MOST_TRIANGLES}")
         return _checked(placed(np.concatenate(found), pose_of(properties)), "pose")
 
     def footprint(self, properties: Properties) -> Any:

@@ -298,6 +298,40 @@ def test_what_cannot_be_read_is_left_out_and_told() -> None:
     assert notes.dropped == [{"what": "objects with solids", "count": 1, "why": "their solids cannot be read"}]
 
 
+def test_bodies_without_files_are_told_apart_from_marks() -> None:
+    rows: list[Any] = [
+        (None, {"kind": "model", "shapes": [BOX]}),
+        (shapely.Point(0, 0), {"kind": "include", "name": "Ground Plane"}),
+        (shapely.Point(0, 0), {"kind": "light"}),
+    ]
+    notes = Notes()
+    grid(layers(objects(*rows)), notes)
+    assert {d["what"]: d["why"] for d in notes.dropped} == {
+        "objects light": "nothing in a robot's way",
+        "objects include": "they say neither shapes nor a size: their files were not uploaded",
+    }
+
+
+def test_a_mesh_that_stands_everywhere_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    from app.derive import _obstacles
+    from app.model import solids
+
+    monkeypatch.setattr(_obstacles, "MOST_TRIANGLES", 100)
+    with pytest.raises(CannotConvert, match="more than 100 triangles"):
+        grid(layers(objects(*[(None, {"kind": "model", "shapes": [BOX]})] * 9)))
+    monkeypatch.setattr(solids, "MOST_TRIANGLES", 20)
+    notes = Notes()
+    one = (None, {"kind": "model", "shapes": [BOX]})
+    grid(layers(objects(one, (None, {"kind": "model", "shapes": [BOX, BOX]}))), notes)
+    assert "more than 20 triangles" in notes.warnings[0].problem
+
+
+def test_objects_beyond_the_local_frame_are_a_clear_problem() -> None:
+    far = objects((shapely.box(100, -50, 100.1, -49.9), {"kind": "building"}), anchor="wgs84")
+    with pytest.raises(CannotConvert, match="too far from the datum"):
+        grid(layers(far, datum=DATUM))
+
+
 def test_visuals_count_only_where_asked() -> None:
     content = layers(objects((None, {"kind": "model", "shapes": [{**BOX, "visual": True}]})))
     assert occupied(grid(content, visuals=True)) == pytest.approx(2)

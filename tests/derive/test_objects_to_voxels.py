@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import Any
 
 import numpy as np
@@ -93,10 +94,16 @@ def test_nothing_with_a_body_is_a_clear_problem() -> None:
 
 def test_limits_come_before_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CannotConvert, match=r"resolution of at least 3\.05"):
-        voxels(model(BOX, pose=[1e5, 0, 0, 0, 0, 0]))
+        voxels(model(BOX, pose=[1e5, 0, 0, 0, 0, 0]), resolution=1.0)
+    assert voxels(model(BOX, pose=[1e4, 0, 0, 0, 0, 0])).resolution == 0.5
     big = {"type": "box", "size": [2000, 2000, 2000]}
+    start = time.perf_counter()
     with pytest.raises(CannotConvert, match="coarser resolution, or filled=false"):
-        voxels(model(big))
+        voxels(model(big), resolution=0.1)
+    assert time.perf_counter() - start < 1
+    notes = Notes()
+    assert voxels(model(big), notes).resolution == 10.0
+    assert notes.template == [{"what": "resolution", "value": 10.0, "why": "0.1 m would be too many voxels"}]
     from app.derive import objects_to_voxels as module
 
     monkeypatch.setattr(module, "MOST", 5999)
