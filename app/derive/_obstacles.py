@@ -104,6 +104,8 @@ OF_OSM: Mapping[str, Mapping[str, float]] = {
 }
 """OpenStreetMap: by a tag's key and value (``*``: any other), how wide a line or a point is; 0 stands in no way."""
 
+IN_NO_WAY = "nothing in a robot's way"
+
 _NUMBER = re.compile(r"^\s*(\d+(?:[.,]\d+)?)\s*(m|cm|ft|')?\s*$")
 _UNITS = {None: 1.0, "m": 1.0, "cm": 0.01, "ft": 0.3048, "'": 0.3048}
 
@@ -266,7 +268,7 @@ class _Reader:
     def report(self) -> None:
         """What was left out, and why."""
         for kind, count in sorted(self.left.items()):
-            self.notes.drop(f"objects {kind}", count, "nothing in a robot's way")
+            self.notes.drop(f"objects {kind}", count, IN_NO_WAY)
         for kind, count in sorted(self.shapeless.items()):
             self.notes.drop(
                 f"objects {kind}", count, "they say neither shapes nor a size: their files were not uploaded"

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes, _raster, derives
-from app.derive._obstacles import Site, fence_of, fences, sites
+from app.derive._obstacles import IN_NO_WAY, Site, fence_of, fences, sites
 from app.derive._raster import Frame
 from app.errors import Invalid, MissingLayer, Problem
 from app.model.frame import GROUND
@@ -107,6 +107,7 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
             f"; the solids reach from {min(r[0] for r in reach):g} to {max(r[1] for r in reach):g} m" if reach else ""
         )
         what = f"at {low:g} m above the floor" if low == high else f"between {low:g} and {high:g} m above the floor"
+        there += "".join(f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped if d["why"] != IN_NO_WAY)
         raise MissingLayer(
             f"no stored object stands in a robot's way {what}{there}: ask for another height or band, or upload walls, "
             "buildings, barriers, trees or a world with solids"

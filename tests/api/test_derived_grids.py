@@ -111,3 +111,22 @@ def test_real_buildings_and_towns(api: Api, shared: Path) -> None:
         grey, _ = made(api, name, level)
         assert (grey == 0).sum() > 1000
         assert (grey == 254).sum() > 10_000
+
+
+def test_a_world_alone_gives_a_slice(api: Api, shared: Path) -> None:
+    root = shared / "data/gazebo_sdf/turtlebot3_world"
+    files = [p for p in root.rglob("*") if p.is_file() and "maps" not in p.parts]
+    api.post("environments", {"name": "arena"})
+    api.upload("arena", {p.relative_to(root).as_posix(): p.read_bytes() for p in files})
+    grey, said = made(api, "arena", "?height=0.18")
+    low, _ = (np.argwhere(grey[::-1] == 0).min(axis=0) * 0.05 + said["origin"][1::-1]).tolist()
+    assert low == pytest.approx(-3.3985, abs=0.05), "the slice that facts.json counts"
+    line = next(line for line in told(api, "arena", "?height=0.18")["layers"] if line["layer"] == "occupancy")
+    assert line["steps"][0]["parameters"]["height"] == 0.18
+    assert any(name.endswith("wall.dae") for name in line["sources"])
+    dropped = {d["what"]: d["why"] for d in told(api, "arena")["dropped"]}
+    assert "not uploaded" in dropped["objects include"], "the ground plane is on another server"
+    assert api.get("/maps/arena/octomap?resolution=0.2").content.startswith(b"# Octomap")
+    problem: Any = api.get("/maps/arena/occupancy_grid?height=20", expect=None)
+    assert problem.status_code == 422
+    assert "the solids reach from" in problem.json()["detail"]

@@ -312,6 +312,15 @@ def test_bodies_without_files_are_told_apart_from_marks() -> None:
     }
 
 
+def test_what_keeps_a_world_from_being_a_grid_is_told() -> None:
+    rows: list[Any] = [
+        (shapely.Point(0, 0), {"kind": "include"}),
+        (None, {"kind": "model", "shapes": [{"type": "mesh", "file": "a.dae"}]}),
+    ]
+    with pytest.raises(MissingLayer, match=r"1 objects include: .*; 1 objects with solids: "):
+        grid(layers(objects(*rows)))
+
+
 def test_a_mesh_that_stands_everywhere_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     from app.derive import _obstacles
     from app.model import solids

@@ -1,0 +1,141 @@
+"""Gazebo's real worlds as grids, against the maps that robots made in them and against trimesh."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from app import bundle
+from app.bundle import Hints, Known
+from app.derive import Notes
+from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
+from app.derive.objects_to_voxels import Parameters as VoxelParameters
+from app.derive.objects_to_voxels import objects_to_voxels
+from app.formats import Limits
+from app.model.grid import OccupancyGrid
+from app.model.layers import MAP, Layers, PartKey
+from app.model.solids import Solids
+from app.model.voxels import VoxelMap
+
+PAIRS = {
+    # world: folder, file, map, shift of the map (metres), the share of its occupied cells within 10 cm
+    "turtlebot3_world": ("turtlebot3_world", "turtlebot3_world.world", "maps", (0.0, 0.0), 0.97),
+    "aws_small_warehouse": (
+        "aws_small_warehouse",
+        "no_roof_small_warehouse.world",
+        "maps/005",
+        (-0.10, -0.15),
+        0.95,
+    ),
+    # Its map was recorded in an older house: 0.73 is what an independent slice reaches.
+    "turtlebot3_house": ("turtlebot3_house", "turtlebot3_house.world", "maps", (0.0, 0.0), 0.70),
+}
+
+
+def read(files: dict[str, bytes]) -> Layers:
+    told = bundle.read(bundle.unpack(files, Limits()), Hints(), Known(None, None, None, True, False), Limits())
+    return told.layers(None)
+
+
+def world(data: Path, pair: str) -> Layers:
+    folder, name = PAIRS[pair][:2]
+    root = data / "gazebo_sdf" / folder
+    files = [p for p in root.rglob("*") if p.is_file() and "maps" not in p.parts]
+    files = [p for p in files if p.suffix != ".world" or p.name == name]
+    return read({p.relative_to(root).as_posix(): p.read_bytes() for p in files})
+
+
+def sliced(content: Layers, **options: Any) -> OccupancyGrid:
+    made = objects_to_occupancy(content, Parameters(**options), Notes())
+    grid = made.parts[PartKey("occupancy", "ground", MAP)]
+    assert isinstance(grid, OccupancyGrid)
+    return grid
+
+
+def known(data: Path, pair: str) -> dict[str, Any]:
+    facts: dict[str, Any] = json.loads((data / "facts.json").read_text())["_world_map_alignment"]["pairs"][pair]
+    return facts
+
+
+def middles(grid: OccupancyGrid) -> Any:
+    """(x, y) of the occupied cells' middles in metres: float64 [n, 2]."""
+    rows, columns = np.nonzero(grid.cells == 100)
+    return (np.column_stack([columns, rows]) + 0.5) * grid.resolution + grid.origin[:2]
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_a_slice_covers_the_map_that_a_robot_made_there(shared: Path, pair: str) -> None:
+    from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+
+    data = shared / "data"
+    folder, _, maps, shift, least = PAIRS[pair]
+    facts = known(data, pair)
+    grid = sliced(world(data, pair), height=facts["slice_z_m"])
+    files = {p.name: p.read_bytes() for p in (data / "gazebo_sdf" / folder / maps).iterdir()}
+    (measured,) = read(files).grids().values()
+    away, _ = cKDTree(middles(grid)).query(middles(measured) - shift)
+    assert (away <= 0.1 + 1e-9).mean() >= least
+    (low, high) = facts["slice_bbox"]
+    at = middles(grid)
+    assert at.min(axis=0) == pytest.approx(low, abs=0.05)
+    assert at.max(axis=0) == pytest.approx(high, abs=0.05)
+    assert (grid.cells == 100).mean() < 0.25, "rooms stay free"
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_surfaces_are_where_trimesh_cuts_them(shared: Path, pair: str) -> None:
+    """Every cell that trimesh's slice runs through is occupied; its total length is the facts'."""
+    trimesh: Any = importlib.import_module("trimesh")
+    content = world(shared / "data", pair)
+    facts = known(shared / "data", pair)
+    height = facts["slice_z_m"]
+    grid = sliced(content, height=height)
+    solids = Solids(content.resources())
+    length, hit, total = 0.0, 0, 0
+    for part in content.vector("objects").values():
+        for properties in part.properties:
+            corners = solids.triangles(properties)
+            if not len(corners):
+                continue
+            mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners), process=False)
+            cut = trimesh.intersections.mesh_plane(mesh, [0, 0, 1], [0, 0, height])[:, :, :2]
+            lines = shapely.linestrings(cut)
+            length += float(shapely.length(lines).sum())
+            steps = np.linspace(0.01, 0.99, 50)[None, :, None]
+            at = (cut[:, None, 0] * (1 - steps) + cut[:, None, 1] * steps).reshape(-1, 2)
+            # What runs exactly along the border of two cells may be in either.
+            found = np.zeros(len(at), bool)
+            for aside in ((1e-5, 1e-5), (-1e-5, 1e-5), (1e-5, -1e-5), (-1e-5, -1e-5)):
+                column, row = np.floor((at + aside - grid.origin[:2]) / grid.resolution).astype(int).T
+                found |= grid.cells[row, column] == 100
+            hit += int(found.sum())
+            total += len(at)
+    assert hit >= 0.999 * total
+    assert length == pytest.approx(facts["slice_total_length_m"], rel=0.01)
+
+
+def test_the_warehouse_as_voxels(shared: Path) -> None:
+    content = world(shared / "data", "aws_small_warehouse")
+    made = objects_to_voxels(content, VoxelParameters(), Notes()).parts[PartKey("voxels", "ground", MAP)]
+    assert isinstance(made, VoxelMap)
+    assert made.resolution == 0.1
+    box = made.bounds()
+    assert box is not None
+    assert box[:2] == pytest.approx((-7.0, -10.5), abs=0.11)
+    assert box[3:5] == pytest.approx((7.0, 10.5), abs=0.11)
+    grid = sliced(content, band=(1.0, 1.1), resolution=0.1)
+    (za, zb) = made.axis(2)
+    here = (za <= 10) & (zb > 10)
+    x0, y0 = (round(v / 0.1) for v in grid.origin[:2])
+    flat = np.zeros_like(grid.cells)
+    (xa, xb), (ya, yb) = made.axis(0), made.axis(1)
+    for a, b, c, d in zip(xa[here] - x0, xb[here] - x0, ya[here] - y0, yb[here] - y0, strict=True):
+        flat[c:d, a:b] = 100
+    differ = (flat == 100) != (grid.cells == 100)
+    assert differ.sum() < 0.01 * (grid.cells == 100).sum(), "a layer of the octree is a band of the world"
