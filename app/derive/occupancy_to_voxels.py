@@ -1,0 +1,228 @@
+"""Occupancy -> voxels: a grid's cells as columns of an octree."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes, derives
+from app.errors import CannotConvert, MissingLayer
+from app.model import masks
+from app.model.grid import UNKNOWN, OccupancyGrid
+from app.model.layers import MAP, Layers, Part, PartKey
+from app.model.voxels import DEPTH, HALF, LOG_ODDS, VoxelMap, morton
+from app.parameters import parameter
+
+MOST = 2**25
+"""Leaves (``Limits.voxels``)."""
+
+COLUMNS = 2**28
+"""Columns that are looked at (``Limits.pixels``)."""
+
+MASKS = frozenset({"keepout", "speed", "nogo", "preferred"})
+"""Grids that tell where robots should go, not what stands there."""
+
+ROWS = 2**9
+"""Rows that are sampled at once."""
+
+States = NDArray[np.uint8]
+"""0 unknown, 1 free, 2 occupied."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """How high and how fine."""
+
+    height: float = parameter(
+        2.0, "how high what is occupied stands above the floor", minimum=1e-3, maximum=1e3, unit="m"
+    )
+    resolution: float | None = parameter(
+        None, "metres an edge of the smallest voxel; default: the grid's", minimum=1e-3, maximum=1e3, unit="m"
+    )
+    free: bool = parameter(True, "whether free cells become free voxels of the same height, or stay unknown")
+
+
+@derives(gives="voxels", needs={"occupancy"}, parameters=Parameters, cost=8.0)
+def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+    """The extrusion of a grid: each occupied cell as a column from the level's floor up, each free one as free space.
+
+    One voxel map of its name for each grid; where a level has a grid ``map``, of that one alone, and never of costmap
+    filter masks. A cell that is turned or shifted against the voxels occupies all that it reaches into. Raises
+    MissingLayer where nothing is known, CannotConvert where the octree would be too large.
+    """
+    parts: dict[PartKey, Part] = {}
+    found = [k for k, grid in layers.grids().items() if k.name not in MASKS and masks.NAME not in grid.properties]
+    mains = {key.level for key in found if key.name == MAP}
+    for key in found:
+        if key.level in mains and key.name != MAP:
+            continue
+        made = _extruded(layers.grids()[key], parameters, layers.elevation(key.level), key.name)
+        if made is not None:
+            parts[PartKey("voxels", key.level, key.name)] = made
+            if not made.leaf_counts()["occupied"]:
+                notes.warn(f"{key.name}: the grid has no occupied cell, so the voxels hold free space only")
+    if not parts:
+        raise MissingLayer(
+            "voxels are made of a grid's occupied and free cells, and the stored grids have none: upload an occupancy "
+            "grid, an octree or a point cloud"
+        )
+    notes.fill("height", parameters.height, "a grid does not say how high what it shows is")
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def _extruded(grid: OccupancyGrid, parameters: Parameters, floor: float, name: str) -> VoxelMap | None:
+    edge = parameters.resolution or grid.resolution
+    state, corner = _columns(grid, edge, parameters.free, name)
+    if not state.any():
+        return None
+    bottom = round(floor / edge)
+    top = bottom + max(1, round(parameters.height / edge))
+    if min(*corner, bottom) < -HALF or max(corner[0] + state.shape[1], corner[1] + state.shape[0], top) > HALF:
+        raise CannotConvert(
+            f"an octree of {edge:g} m voxels reaches {HALF * edge:g} m from the origin, the grid {name} goes beyond: "
+            "ask for a coarser resolution"
+        )
+    depth, code, odds = _leaves(state, corner, bottom, top, name)
+    return VoxelMap(edge, depth, code, odds)
+
+
+def _states(grid: OccupancyGrid) -> States:
+    """What the cells mean; values between the thresholds are unknown."""
+    values = np.zeros(256, np.uint8)
+    percent = np.arange(101) / 100
+    values[:101][percent <= grid.free_thresh] = 1
+    values[:101][percent >= grid.occupied_thresh] = 2
+    values[0], values[100], values[UNKNOWN] = 1, 2, 0
+    return values[grid.cells]
+
+
+def _columns(grid: OccupancyGrid, edge: float, free: bool, name: str) -> tuple[States, tuple[int, int]]:
+    """What stands in each column of voxels: uint8 [rows, columns], row 0 at the smallest y; and the first one's place,
+    x and y in voxels from the origin."""
+    state = _states(grid)
+    if not free:
+        state[state == 1] = 0
+    x, y, yaw = grid.origin
+    column, row = x / edge, y / edge
+    straight = yaw == 0.0 and abs(grid.resolution - edge) <= 1e-9 * edge
+    if straight and max(abs(column - round(column)), abs(row - round(row))) < 1e-3:
+        return state, (round(column), round(row))
+    corners = grid.corners() / edge
+    left, bottom = (math.floor(v + 1e-6) for v in corners.min(axis=0))
+    right, top = (math.ceil(v - 1e-6) for v in corners.max(axis=0))
+    width, height = max(1, right - left), max(1, top - bottom)
+    if width * height > COLUMNS:
+        raise CannotConvert(
+            f"the grid {name} would be {width} × {height} columns of voxels of {edge:g} m; the limit is {COLUMNS}: ask "
+            "for a coarser resolution"
+        )
+    out = np.zeros((height, width), np.uint8)
+    c, s = math.cos(yaw), math.sin(yaw)
+    across = (np.arange(width) + left + 0.5) * edge - x
+    for start in range(0, height, ROWS):
+        along = ((np.arange(start, min(height, start + ROWS)) + bottom + 0.5) * edge - y)[:, None]
+        u = np.floor((across * c + along * s) / grid.resolution).astype(np.int64)
+        v = np.floor((along * c - across * s) / grid.resolution).astype(np.int64)
+        there = (u >= 0) & (u < grid.width) & (v >= 0) & (v < grid.height)
+        out[start : start + ROWS][there] = state[v[there], u[there]]
+    _splat(out, state, grid, edge, (left, bottom))
+    return out, (left, bottom)
+
+
+def _splat(out: States, state: States, grid: OccupancyGrid, edge: float, corner: tuple[int, int]) -> None:
+    """Draw occupied cells into all columns that they reach into: their corners, and points between as far apart as half
+    a voxel at most."""
+    v, u = np.nonzero(state == 2)
+    x, y, yaw = grid.origin
+    c, s = math.cos(yaw), math.sin(yaw)
+    steps = max(2, math.ceil(2 * grid.resolution / edge) + 1)
+    inset = 1e-6
+    for a in np.linspace(inset, 1 - inset, steps):
+        for b in np.linspace(inset, 1 - inset, steps):
+            p, q = (u + a) * grid.resolution, (v + b) * grid.resolution
+            column = np.floor((x + p * c - q * s) / edge).astype(np.int64) - corner[0]
+            row = np.floor((y + p * s + q * c) / edge).astype(np.int64) - corner[1]
+            out[np.clip(row, 0, out.shape[0] - 1), np.clip(column, 0, out.shape[1] - 1)] = 2
+
+
+def _leaves(
+    state: States, corner: tuple[int, int], bottom: int, top: int, name: str
+) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32]]:
+    """Depth, code and log-odds of the fewest leaves: squares of equal columns, cut into cubes between two heights."""
+    pieces = _pieces(bottom + HALF, top + HALF)
+    tallest = max(k for _, k in pieces)
+    squares = _squares(state, (corner[0] + HALF, corner[1] + HALF), tallest)
+    depths, codes, odds = [], [], []
+    total = 0
+    for start, k in pieces:
+        for j in range(k + 1):
+            every, largest = squares[j]
+            x, y, what = every if j == k else largest
+            stack = 1 << (k - j)
+            total += len(x) * stack
+            if total > MOST:
+                raise CannotConvert(
+                    f"the grid {name} would become more than {MOST} voxels: ask for a coarser resolution or a smaller "
+                    "height"
+                )
+            z = (start >> j) + np.arange(stack, dtype=np.int64)
+            n = len(x)
+            # Of the squares as smallest voxels from the middle, so that their codes can be cut to the depth.
+            whole = [np.repeat(x << j, stack) - HALF, np.repeat(y << j, stack) - HALF, np.tile(z << j, n) - HALF]
+            codes.append(morton(*whole) >> np.uint64(3 * j))
+            depths.append(np.full(n * stack, DEPTH - j, np.uint8))
+            odds.append(np.repeat(np.array(LOG_ODDS, np.float32)[what.astype(np.intp) - 1], stack))
+    depth, code, odd = np.concatenate(depths), np.concatenate(codes), np.concatenate(odds)
+    order = np.argsort(code << (np.uint64(3) * (np.uint64(DEPTH) - depth.astype(np.uint64))))
+    return depth[order], code[order], odd[order]
+
+
+def _pieces(start: int, end: int) -> list[tuple[int, int]]:
+    """A range of whole numbers as (start, k): 2^k of them from a multiple of 2^k on."""
+    out = []
+    while start < end:
+        k = (start & -start).bit_length() - 1 if start else DEPTH - 1
+        while k > DEPTH - 1 or start + (1 << k) > end:
+            k -= 1
+        out.append((start, k))
+        start += 1 << k
+    return out
+
+
+Square = tuple[NDArray[np.int64], NDArray[np.int64], States]
+
+
+def _squares(state: States, corner: tuple[int, int], most: int) -> list[tuple[Square, Square]]:
+    """For each size 2^j up to 2^most: all aligned squares of known, equal columns, and those that lie in no larger one.
+
+    A square is its x and y in units of its size, and its state. corner: x and y of the first column, from the tree's
+    edge.
+    """
+    levels = [(state, corner)]
+    for _ in range(most):
+        levels.append(_halved(*levels[-1]))
+    out = []
+    for j, (here, (x0, y0)) in enumerate(levels):
+        row, column = np.nonzero(here)
+        what = here[row, column]
+        x, y = column + x0, row + y0
+        alone = np.ones(len(row), bool)
+        if j < most:
+            above, (left, low) = levels[j + 1]
+            alone = above[(y >> 1) - low, (x >> 1) - left] == 0
+        out.append(((x, y, what), (x[alone], y[alone], what[alone])))
+    return out
+
+
+def _halved(state: States, corner: tuple[int, int]) -> tuple[States, tuple[int, int]]:
+    """Squares of twice the size: their state where all four quarters have it, else 0."""
+    x0, y0 = corner
+    height, width = state.shape
+    around = ((y0 & 1, (y0 + height) & 1), (x0 & 1, (x0 + width) & 1))
+    padded = np.pad(state, around)
+    quarters = padded[0::2, 0::2], padded[0::2, 1::2], padded[1::2, 0::2], padded[1::2, 1::2]
+    equal = (quarters[0] == quarters[1]) & (quarters[0] == quarters[2]) & (quarters[0] == quarters[3])
+    return np.where(equal, quarters[0], np.uint8(0)), (x0 >> 1, y0 >> 1)

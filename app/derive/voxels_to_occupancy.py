@@ -1,0 +1,199 @@
+"""Voxels -> occupancy: a height band of an octree or a point cloud as a grid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes, derives
+from app.errors import CannotConvert, MissingLayer
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import Layers, Part, PartKey
+from app.model.voxels import DEPTH, HALF, VoxelMap, gather
+from app.parameters import parameter
+
+MOST = 2**28
+"""Cells of a grid whatever was asked for (``Limits.pixels``)."""
+
+LONGEST = 32767
+"""Cells along a side: beyond it Nav2's map_server refuses the map."""
+
+FULL = 0.95
+"""From this share of occupied cells on the floor has probably been taken for an obstacle."""
+
+RANK = np.array([1, 0, 2], np.uint8)
+"""Of unknown, free, occupied: a coarser cell has the highest rank of what it covers, as in ``occupancy_grid``."""
+
+VALUE = np.array([FREE, UNKNOWN, OCCUPIED], np.uint8)
+"""Of a rank, the cell's value."""
+
+States = NDArray[np.uint8]
+"""0 unknown, 1 free, 2 occupied."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """Which heights count, and how fine the grid is."""
+
+    band: tuple[float, float] | None = parameter(
+        None,
+        "low,high: voxels between two heights above the level's floor; default: the full height",
+        minimum=-1e5,
+        maximum=1e5,
+        unit="m",
+    )
+    resolution: float | None = parameter(
+        None,
+        "metres a cell; default: the voxels'. A coarser cell is occupied if anything in it is, then unknown, then free",
+        minimum=1e-3,
+        maximum=1e3,
+        unit="m",
+    )
+
+
+@derives(gives="occupancy", needs={"voxels"}, parameters=Parameters, cost=2.0)
+def voxels_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+    """The projection of a height band: occupied where any voxel of the column is, free where only free ones are.
+
+    One grid of its name for each voxel map; around all its voxels whatever the band, so that the frame stays when the
+    band changes; yaw 0, the origin a whole multiple of the resolution. Raises MissingLayer where no voxel lies in the
+    band, CannotConvert where the grid would be too large or the band ends below its start.
+    """
+    if parameters.band is not None and not parameters.band[0] < parameters.band[1]:
+        low, high = parameters.band
+        raise CannotConvert(f"a band goes from its lower to its higher end, got {low:g},{high:g}")
+    parts: dict[PartKey, Part] = {}
+    seen: list[str] = []
+    for key, part in layers.of("voxels").items():
+        if not isinstance(part, VoxelMap) or not len(part):
+            continue
+        made = _projected(part, parameters, layers.elevation(key.level))
+        if made is None:
+            z = part.bounds()
+            seen.append(f"{key.name} from {z[2]:g} to {z[5]:g} m above the local origin" if z else key.name)
+            continue
+        parts[PartKey("occupancy", key.level, key.name)] = made
+        _doubts(key, part, made, parameters, notes)
+    if not parts:
+        why = f"no voxel lies in the band; there are: {'; '.join(seen)}" if seen else "the voxel maps hold no voxels"
+        raise MissingLayer(f"{why}. Ask with another band=low,high, or upload an octree or a point cloud")
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def _doubts(key: PartKey, voxels: VoxelMap, made: OccupancyGrid, parameters: Parameters, notes: Notes) -> None:
+    counts = made.counts()
+    known = counts["occupied"] + counts["free"]
+    if parameters.band is None and counts["occupied"] >= FULL * known:
+        notes.warn(
+            f"{key.name}: nearly every column has something in it, the floor too: ask with band=low,high for the "
+            "heights at which a robot meets it"
+        )
+    if not voxels.leaf_counts()["free"]:
+        notes.warn(f"{key.name}: the voxels tell of no free space, so whatever is not occupied is unknown")
+
+
+def _projected(voxels: VoxelMap, parameters: Parameters, floor: float) -> OccupancyGrid | None:
+    """The grid of a voxel map; None where nothing lies in the band. floor: metres above the local origin."""
+    edge = voxels.resolution
+    bounds = [(int(low.min()), int(high.max())) for low, high in (voxels.axis(0), voxels.axis(1))]
+    _check_size([high - low for low, high in bounds], edge, "upload voxels of a coarser resolution or a smaller place")
+    inside = np.ones(len(voxels), bool)
+    if parameters.band is not None:
+        low, high = voxels.axis(2)
+        bottom, top = ((floor + v) / edge for v in parameters.band)
+        inside = (high > _near(bottom)) & (low < _near(top))
+        if not inside.any():
+            return None
+    state = _columns(voxels, inside, bounds)
+    size = parameters.resolution or edge
+    if abs(size - edge) <= 1e-9 * edge:
+        cells = VALUE[RANK][state]
+        first = [bounds[0][0], bounds[1][0]]
+        size = edge
+    else:
+        ranks = RANK[state]
+        spans = [(math.floor(_near(a * edge / size)), math.ceil(_near(b * edge / size))) for a, b in bounds]
+        _check_size([last - begin for begin, last in spans], size, "ask with a coarser resolution")
+        for axis, source, span in ((1, bounds[0], spans[0]), (0, bounds[1], spans[1])):
+            ranks = _resampled(ranks, axis, source, span, size / edge)
+        first = [begin for begin, _ in spans]
+        cells = VALUE[ranks]
+    x, y = (round(v * size, 9) for v in first)
+    return OccupancyGrid(cells, size, (x, y, 0.0))
+
+
+def _check_size(sides: list[int], edge: float, instead: str) -> None:
+    if max(sides) > LONGEST or sides[0] * sides[1] > MOST:
+        raise CannotConvert(
+            f"{sides[0]} × {sides[1]} cells of {edge:g} m are more than a grid may have (a side of {LONGEST}, {MOST} "
+            f"in all): {instead}"
+        )
+
+
+def _columns(voxels: VoxelMap, inside: NDArray[np.bool_], bounds: list[tuple[int, int]]) -> States:
+    """What stands in each column of smallest voxels: uint8 [rows, columns], row 0 at the smallest y.
+
+    From the coarsest leaves down: each step doubles the picture and draws the leaves of the next depth into it, so a
+    large leaf costs no more than a small one.
+    """
+    window = [(low + HALF, high + HALF) for low, high in bounds]
+    picture = np.zeros((1, 1), np.uint8)
+    start = (0, 0)
+    x, y = gather(voxels.code), gather(voxels.code >> np.uint64(1))
+    for depth in range(1, DEPTH + 1):
+        up = DEPTH - depth
+        (x0, x1), (y0, y1) = [(low >> up, -(-high >> up)) for low, high in window]
+        picture = picture.repeat(2, axis=0).repeat(2, axis=1)
+        top, left = y0 - 2 * start[0], x0 - 2 * start[1]
+        picture = np.ascontiguousarray(picture[top : top + y1 - y0, left : left + x1 - x0])
+        start = (y0, x0)
+        here = np.flatnonzero((voxels.depth == depth) & inside)
+        if not len(here):
+            continue
+        row, column = y[here].astype(np.int64) - y0, x[here].astype(np.int64) - x0
+        occupied = voxels.log_odds[here] >= 0
+        free = row[~occupied], column[~occupied]
+        picture[free] = np.maximum(picture[free], 1)
+        picture[row[occupied], column[occupied]] = 2
+    return picture
+
+
+def _resampled(ranks: States, axis: int, source: tuple[int, int], span: tuple[int, int], ratio: float) -> States:
+    """Cells of another size along one axis.
+
+    source: first and end of the cells that are there, counted from the origin; span: of the wanted ones, each ``ratio``
+    as long. A coarser cell has the highest of what it covers (nothing is unknown), a finer one what is at its middle.
+    """
+    start, end = source
+    number = np.arange(*span, dtype=np.float64)
+    if ratio < 1:
+        middle = np.floor((number + 0.5) * ratio).astype(np.int64) - start
+        return np.take(ranks, np.clip(middle, 0, end - start - 1), axis=axis)
+    begin = np.floor(_nears(number * ratio)).astype(np.int64) - start
+    stop = np.ceil(_nears((number + 1) * ratio)).astype(np.int64) - start
+    beyond = (begin < 0) | (stop > end - start)
+    begin, stop = np.clip(begin, 0, None), np.clip(stop, None, end - start)
+    pairs = np.stack([begin, stop], axis=1).ravel()
+    pad = [(0, 0), (0, 0)]
+    pad[axis] = (0, 1)  # so that the last one's end is an index, too
+    out = np.maximum.reduceat(np.pad(ranks, pad), pairs, axis=axis)
+    out = np.ascontiguousarray(np.take(out, np.arange(0, len(pairs), 2), axis=axis))
+    at = [slice(None), slice(None)]
+    for k in np.flatnonzero(beyond).tolist():
+        at[axis] = slice(k, k + 1)
+        out[tuple(at)] = np.maximum(out[tuple(at)], RANK[0])
+    return out
+
+
+def _near(value: float) -> float:
+    """A whole number where it is one but for the rounding of a division."""
+    whole = round(value)
+    return float(whole) if abs(value - whole) < 1e-6 else value
+
+
+def _nears(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    whole = np.round(values)
+    return np.where(np.abs(values - whole) < 1e-6, whole, values)
