@@ -24,6 +24,7 @@ from app.model import network
 from app.model.features import Features, concatenate, from_columns, unique_ids
 from app.model.frame import GROUND, Datum, Level
 from app.model.geodesy import local_frame
+from app.model.imagery import Picture
 from app.model.layers import NETWORK, SITE, ZONES, Layer, Layers, Part, PartKey, Resources, is_empty, join_levels
 
 TEMPLATE_FOLDERS = ("location", "metric", "topological", "world")
@@ -34,6 +35,9 @@ _FOLDER_LAYER: Mapping[str, Layer] = {"location": "location", "topological": "to
 DRAWN_LAYERS: tuple[Layer, ...] = ("objects", "topology", "location", "zones")
 
 _QUIET = re.compile(r"(^|/)(\.|license|licence|copying|readme|notice|authors|changelog)", re.IGNORECASE)
+_LICENCE = re.compile(r"(licen[cs]e|copying|notice|attribution|copyright)([-.].*)?", re.IGNORECASE)
+_COPYRIGHT = re.compile(r"(copyright|©|\(c\)).*\d{4}", re.IGNORECASE)
+_NOTICE_BYTES, _NOTICE_LINE = 2**14, 160
 _FENCE = re.compile(r"fence|boundary|perimeter", re.IGNORECASE)
 
 SAME_PLACE_DEGREES = 1e-7
@@ -90,6 +94,20 @@ class Bundle:
     files: dict[str, Use] = field(default_factory=dict)
     warnings: list[Problem] = field(default_factory=list)
     fence: shapely.Polygon | None = None
+    notices: dict[str, str] = field(default_factory=dict)
+
+    def credit(self, key: PartKey) -> tuple[str, ...]:
+        """Licences and credits of a part: what its files say themselves, and the licence files of their folders."""
+        part = self.parts[key]
+        said = part.document.get("attribution", ()) if isinstance(part, Features) else ()
+        said = part.attribution if isinstance(part, Picture) else said
+        texts = [text for text in said if isinstance(text, str)] if isinstance(said, list | tuple) else []
+        names, _ = self.origin.get(key, ((), ""))
+        for notice, text in sorted(self.notices.items()):
+            folder = notice.rpartition("/")[0]
+            if any(not folder or name.startswith(f"{folder}/") for name in names):
+                texts.append(text)
+        return tuple(dict.fromkeys(texts))
 
     def layers(self, datum: Datum | None) -> Layers:
         """The parts under a datum (the bundle's own wins)."""
@@ -140,6 +158,7 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits) -> Bundle:
     bundle = Bundle(files={name: Use() for name in files})
     variables = _read_variables(files, bundle)
     groups, rest = _group({n: d for n, d in files.items() if n not in variables}, hints)
+    bundle.notices = {name: text for name in rest if (text := _notice(name, files[name]))}
     taken = _set_aside(groups, bundle)
     _check_options(groups, hints)
     found: list[Read] = []
@@ -197,6 +216,20 @@ def corner(parts: Mapping[PartKey, Part]) -> Datum | None:
     if east - west > 180.0:  # the data lies on both sides of the antimeridian: west is the smallest eastern longitude
         west = boxes[boxes[:, 0] > 0.0, 0].min()
     return Datum(float(np.clip(south, -85.0, 85.0)), float(west))
+
+
+def _notice(name: str, data: bytes) -> str | None:
+    """What a LICENSE, NOTICE or COPYING file says in a line: its title and who holds the copyright. None for others."""
+    if not _LICENCE.fullmatch(PurePosixPath(name).name) or not data:
+        return None
+    text = data[:_NOTICE_BYTES].decode("utf-8", "replace")
+    lines = [" ".join(line.split()).strip("#*=- ")[:_NOTICE_LINE] for line in text.splitlines()]
+    lines = ["".join(c for c in line if c.isprintable()) for line in lines if line]
+    if not lines:
+        return None
+    told = lines[:2] if len(lines) > 1 and re.match(r"version\b", lines[1], re.IGNORECASE) else lines[:1]
+    holder = next((line for line in lines if _COPYRIGHT.match(line) and line not in told), None)
+    return f"{', '.join([*told, *filter(None, [holder])])} ({name})"
 
 
 def _group(files: Files, hints: Hints) -> tuple[list[Group], list[str]]:

@@ -79,7 +79,8 @@ def _made(
             raise recipes.exhausted(error, failed) from error
         kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
         try:
-            return making.write(known, kept, asked, way, origin=told.origin)
+            credit = {key: told.credit(key) for key in told.parts}
+            return making.write(known, kept, asked, way, origin=told.origin, credit=credit)
         except CannotDerive as error:
             without |= {error.step}
             failed.append(error.detail)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import mimetypes
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +17,6 @@ from app.errors import CannotDerive, FleetMapError, Problem
 from app.formats import Format, WriteContext, _archive
 from app.model.features import Features
 from app.model.frame import GROUND
-from app.model.imagery import Picture
 from app.model.layers import LAYERS, VECTOR_LAYERS, Layer, Layers, PartKey
 from app.store import Store
 from app.store.values import PartEntry, Version
@@ -68,15 +67,19 @@ def write(
     way: Chain,
     entries: Mapping[PartKey, PartEntry] | None = None,
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None = None,
+    credit: Mapping[PartKey, Sequence[str]] | None = None,
 ) -> Written:
-    """Derive and write. ``entries`` (of a stored version) or ``origin`` (of files) say where each part came from."""
+    """Derive and write. ``entries`` (of a stored version) or ``origin`` and ``credit`` (of files) say where each part
+    came from, and under which licences and credits."""
     notes = derive.Notes()
     made = derive.run(way.steps, layers, notes)
     context = WriteContext(options=recipes.own_options(known, values))
     chosen = known.choose(sorted(k for k in made.parts if k.layer in known.carries), context.options)
     used = Layers({k: made.parts[k] for k in chosen}, made.datum, made.levels)
+    noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
+    lines = _told(used, layers, way, entries or {}, origin or {}, noted)
+    context.attribution = tuple(sorted(credits_of(lines)))  # whichever part came first: equal content, equal bytes
     files = formats.write(known, used, context)
-    lines = _told(used, layers, way, entries or {}, origin or {})
     report = {
         "format": known.name,
         "layers": lines,
@@ -109,6 +112,7 @@ def _told(
     way: Chain,
     entries: Mapping[PartKey, PartEntry],
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]],
+    noted: Mapping[PartKey, Sequence[str]],
 ) -> list[dict[str, Any]]:
     """For each part in the map: raw, derived or template, by which steps, from which sources."""
     out = []
@@ -123,16 +127,16 @@ def _told(
             sources = sorted({s for k, e in entries.items() if k.layer in roots for s in e.provenance.sources})
             sources = sources or sorted({s for k, (n, _) in origin.items() if k.layer in roots for s in n})
             needed = [k for k in before.parts if k.layer in roots]
-            credit = list(dict.fromkeys(text for k in needed for text in _credit(k, before, entries)))
+            credit = list(dict.fromkeys(text for k in needed for text in noted.get(k, ())))
             done = [step.as_dict() for step in way.steps if step in way_here]
             line |= {"information": "derived", "steps": done, "sources": sources, "attribution": credit}
         elif key in entries:
             p = entries[key].provenance
             line |= {"information": p.information, "steps": [dict(s) for s in p.steps], "sources": list(p.sources)}
-            line["attribution"] = _credit(key, before, entries)
+            line["attribution"] = list(noted.get(key, ()))
         else:
             line |= {"information": "raw", "steps": [], "sources": list(origin.get(key, ((), ""))[0])}
-            line["attribution"] = _credit(key, before, entries)
+            line["attribution"] = list(noted.get(key, ()))
         out.append(line)
     if used.datum is not None and not any(line["layer"] == "location" for line in out):
         site = {"layer": "location", "level": GROUND, "name": "datum", "information": "raw"}
@@ -153,17 +157,6 @@ def _ancestry(layer: Layer, steps: Mapping[Layer, Step]) -> tuple[set[Step], set
         todo += [need for need in step.reads if need in steps]
         roots |= {need for need in step.reads if need not in steps}
     return done, roots
-
-
-def _credit(key: PartKey, layers: Layers, entries: Mapping[PartKey, PartEntry]) -> list[str]:
-    """Licences and credits of a part: what the version notes of its sources, else what the part itself says."""
-    if key in entries:
-        return list(entries[key].provenance.attribution)
-    part = layers.parts.get(key)
-    if isinstance(part, Picture):
-        return list(part.attribution)
-    said = part.document.get("attribution", ()) if isinstance(part, Features) else ()
-    return [text for text in said if isinstance(text, str)] if isinstance(said, list | tuple) else []
 
 
 def credits_of(lines: Iterable[Mapping[str, Any]]) -> list[str]:

@@ -285,6 +285,7 @@ def _key(version: Version, known: Format, options: Any, way: Chain, entries: Map
         "options": parameters.canonical(options),
         "steps": [[s.name, s.version, s.given] for s in way.steps],
         "parts": [[k.layer, k.level, k.name, entries[k].hash] for k in way.keys],
+        "attribution": sorted({text for k in way.keys for text in entries[k].provenance.attribution}),
         "datum": version.datum.as_dict() if version.datum else None,
         "levels": [[level.name, level.elevation] for level in version.levels],
     }

@@ -461,6 +461,7 @@ class _Reader:
         self.grids: dict[PartKey, OccupancyGrid] = {}
         self.columns: dict[str, list[tuple[list[str], list[Any], list[dict[str, Any]]]]] = {}
         self.documents: dict[str, dict[str, Any]] = {}
+        self.credit: list[str] = []
 
     def read(self, root: etree._Element, name: str, entry: str | None) -> None:
         """A document, and those that we have put inside it."""
@@ -616,6 +617,9 @@ class _Reader:
                 document = unspell(words.get("document", "{}"))
                 own = self.own.setdefault(self._key(words, words["layer"]), _Own())
                 own.document |= document if isinstance(document, dict) else {}
+            described = child(element, "description")
+            if words[MARK] == "map" and described is not None:
+                self.credit += [line for line in (described.text or "").splitlines() if line]
             left = [c for c in element if local_name(c) not in ("name", "description", "visibility", "open")]
             parent = element.getparent()
             if left:
@@ -722,8 +726,24 @@ class _Reader:
             made = self._own_part(key, own)
             known = parts.get(key)
             parts[key] = _both(known, made) if isinstance(known, Features) else made
+        parts = self._credited(parts)
         levels = tuple(Level(n, e) for n, e in sorted(self.levels.items(), key=lambda v: (v[1], v[0])))
         return Layers(parts, self.datum, levels or (Level(self.context.level),))
+
+    def _credited(self, parts: dict[PartKey, Part]) -> dict[PartKey, Part]:
+        """Our map's description tells the licences and credits of all its parts; some parts tell their own besides."""
+        stated = {
+            k: said if isinstance(said := p.document.get("attribution"), list) else []
+            for k, p in parts.items()
+            if isinstance(p, Features)
+        }
+        known = [text for said in stated.values() for text in said]
+        extra = [text for text in self.credit if text not in known]
+        out = dict(parts)
+        for key, part in parts.items() if extra else ():
+            if isinstance(part, Features):
+                out[key] = part.with_document({**part.document, "attribution": [*stated[key], *extra]})
+        return out
 
     def _own_part(self, key: PartKey, own: _Own) -> Features:
         """Items of ours as they were: the exact metres where they were local, unless somebody has moved them."""

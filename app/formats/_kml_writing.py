@@ -117,7 +117,7 @@ def _file(documents: list[_Document], ours: str, context: WriteContext) -> str:
     """Drawings and our own folders as one document, in the simplest way that keeps all of it."""
     if len(documents) == 1:
         only = documents[0].xml
-        if not ours and not context.attribution:
+        if not ours and all(escape(text) in only for text in context.attribution):
             return only.replace(END, "") + "\n"
         if END in only and not re.match(r"<[\w.-]+:", only):
             return only.replace(END, _map(ours, context, [])) + "\n"

@@ -161,7 +161,13 @@ def read(files: Files, context: ReadContext) -> Layers:
         _lift(said, own["node"])
         properties.append(said)
     geometry = _node_points(xyz)
-    whole: dict[str, Any] = {NAME: document, **({"tmap": {"layout": "list"}} if legacy else {})}
+    meta = document.get("meta")
+    credit = [
+        text for key in ("attribution", "license", "copyright") if isinstance(meta, dict) and (text := meta.get(key))
+    ]
+    credit = [text for text in credit if isinstance(text, str)]
+    whole: dict[str, Any] = {"attribution": credit} if credit else {}
+    whole |= {NAME: document, **({"tmap": {"layout": "list"}} if legacy else {})}
     if kind == "poi":
         context.warn(f"no node has an edge: the {len(nodes)} nodes are taken as points of interest")
         key = PartKey("objects", context.level, NAME)
@@ -578,6 +584,8 @@ class _Writer:
             self.context.fill("meta.last_updated", EPOCH, "no source tells it in the form that the schema wants")
             if updated is not None:
                 self.context.warn(f"last_updated {updated!r} is no time; {EPOCH} is written", where="meta.last_updated")
+        if self.context.attribution and not meta.keys() & {"attribution", "license", "copyright"}:
+            meta["attribution"] = "; ".join(self.context.attribution)
         document["meta"] = meta
         if "transformation" not in document:
             document["transformation"] = TRANSFORMATION

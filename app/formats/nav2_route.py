@@ -143,10 +143,12 @@ class _Reader:
                 "throws; they are served as floats"
             )
         document: dict[str, Any] = {"members": {w: v for w, v in self.top.items() if w not in ("type", "features")}}
+        credit = [self.top[w] for w in ("attribution", "license", "copyright") if isinstance(self.top.get(w), str)]
         document |= {"ignored": self.ignored} if self.ignored else {}
         document |= {"dangling": self.dangling} if self.dangling else {}
         geometry = np.concatenate([node_points(xyz), lines])
-        part = from_columns([*ids, *edges], geometry, properties, "local", {NAME: document})
+        said = {NAME: document, "attribution": credit} if credit else {NAME: document}
+        part = from_columns([*ids, *edges], geometry, properties, "local", said)
         return Layers({PartKey("topology", self.context.level, NETWORK): part})
 
     def said(self, k: int) -> dict[str, Any]:

@@ -156,9 +156,7 @@ def _operation(
     digest = hashlib.sha256()
     for name in names:
         digest.update(hashlib.sha256(files[name]).digest())
-    provenance = Provenance(
-        "raw", origin, names, digest.hexdigest(), attribution=tuple(_attribution(part)) if part else ()
-    )
+    provenance = Provenance("raw", origin, names, digest.hexdigest(), attribution=told.credit(key))
     held = any(e.key == key for e in base.parts)
     if isinstance(part, Features):
         if key.layer == "topology" and key.level in renamed:

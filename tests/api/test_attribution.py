@@ -1,0 +1,137 @@
+"""Licences and credits of sources: kept with the parts, carried into formats with a place for them (contract, 8)."""
+
+from __future__ import annotations
+
+import zipfile
+from io import BytesIO
+
+import orjson
+import pytest
+import yaml
+from lxml import etree
+
+from app import formats
+from app.bundle import Hints
+from app.convert import offline
+from app.model.frame import Datum
+from tests.api.conftest import Api
+
+HERE = Datum(53.2686, -0.5245)
+ODBL = "http://opendatacommons.org/licenses/odbl/1-0/"
+CREDIT = ["OpenStreetMap & contributors", ODBL]
+OSM = f"""<osm version="0.6" attribution="OpenStreetMap &amp; contributors" license="{ODBL}">
+<node id="1" version="1" lat="53.2686" lon="-0.5245"/><node id="2" version="1" lat="53.2687" lon="-0.5245"/>
+<way id="1" version="1"><nd ref="1"/><nd ref="2"/><tag k="highway" v="path"/></way></osm>""".encode()
+KML = b"""<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>gate</name>
+<Point><coordinates>-0.5245,53.2686</coordinates></Point></Placemark></Document></kml>"""
+LICENSE = b"\n                MIT License\n\nCopyright (c) 2024 A Farm\n\nPermission is hereby granted ...\n"
+MIT = "MIT License, Copyright (c) 2024 A Farm (LICENSE)"
+
+
+def said(name: str, files: dict[str, bytes]) -> str:
+    """What a map shows of its attribution, read by another parser than ours."""
+    data = next(iter(files.values()))
+    if name == "kmz":
+        with zipfile.ZipFile(BytesIO(data)) as z:
+            data = z.read("doc.kml")
+    if name in ("kml", "kmz"):
+        texts = etree.fromstring(data).xpath("//*[local-name() = 'Document']/*[local-name() = 'description']/text()")
+        return "\n".join(texts)
+    if name == "osm":
+        root = etree.fromstring(data)
+        return "; ".join(root.get(k, "") for k in ("attribution", "copyright", "license"))
+    if name == "tmap2":
+        return str(yaml.safe_load(data)["meta"].get("attribution", ""))
+    return str(orjson.loads(data).get("attribution", ""))
+
+
+WITH_A_PLACE = ("osm", "kml", "kmz", "geojson", "tmap2", "nav2_route")
+
+
+@pytest.mark.parametrize("name", WITH_A_PLACE)
+def test_a_format_with_a_place_carries_the_credits_and_gives_them_back(name: str) -> None:
+    made = offline({"a.osm": OSM}, name, datum=HERE)
+    assert sorted(made.report["attribution"]) == sorted(CREDIT)
+    assert all(text in said(name, made.files) for text in CREDIT)
+    # Read back they are known again: to the report, and to the next format.
+    again = offline(made.files, name, hints=Hints(name), datum=HERE)
+    assert again.files == made.files
+    assert all(text in "; ".join(again.report["attribution"]) for text in CREDIT)
+    assert all(text in said("kml", offline(made.files, "kml", hints=Hints(name), datum=HERE).files) for text in CREDIT)
+
+
+@pytest.mark.parametrize("name", WITH_A_PLACE)
+def test_nothing_is_made_up_where_nobody_claims_anything(name: str) -> None:
+    bare = OSM.replace(b'attribution="OpenStreetMap &amp; contributors"', b"").replace(
+        f'license="{ODBL}"'.encode(), b""
+    )
+    made = offline({"a.osm": bare}, name, datum=HERE)
+    assert made.report["attribution"] == []
+    assert said(name, made.files).strip("; ") == ""
+
+
+def test_a_licence_file_is_named_with_what_lies_beside_and_below_it() -> None:
+    files = {"a/LICENSE": LICENSE, "a/maps/gate.kml": KML, "b/field.osm": OSM}
+    told = offline(files, "geojson", datum=HERE)
+    lines = {(line["layer"], line["name"]): line["attribution"] for line in told.report["layers"]}
+    assert lines["objects", "kml"] == ["MIT License, Copyright (c) 2024 A Farm (a/LICENSE)"]
+    assert lines["topology", "network"] == CREDIT
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("LICENSE", LICENSE, MIT),
+        (
+            "COPYING.txt",
+            b"   Apache License\n   Version 2.0, January 2004\nCopyright [yyyy] [name of copyright owner]\n",
+            "Apache License, Version 2.0, January 2004 (COPYING.txt)",
+        ),
+        ("NOTICE.md", "# Maps\n© 2023 Jürgen\n".encode(), "Maps, © 2023 Jürgen (NOTICE.md)"),
+        ("LICENSE", b"\n\n", None),
+        ("license_plates.csv", b"AB 123", None),
+    ],
+)
+def test_what_a_licence_file_says_in_a_line(name: str, text: bytes, expected: str | None) -> None:
+    made = offline({name: text, "gate.kml": KML}, "kml", datum=HERE)
+    assert made.report["attribution"] == ([expected] if expected else [])
+
+
+def test_a_drawing_with_a_licence_shows_it_and_comes_back_as_it_was() -> None:
+    made = offline({"LICENSE": LICENSE, "gate.kml": KML}, "kml", hints=Hints())
+    assert said("kml", made.files) == MIT
+    assert offline(made.files, "kml").files == made.files, "read back and written, the same bytes"
+    alone = offline({"gate.kml": KML}, "kml")
+    assert said("kml", alone.files) == ""
+
+
+def test_a_drawing_that_says_its_credit_itself_is_left_as_it_is() -> None:
+    known = KML.replace(b"<Document>", f"<Document><description>{MIT}</description>".encode())
+    made = offline({"LICENSE": LICENSE, "gate.kml": known}, "kml")
+    assert made.files == offline({"gate.kml": known}, "kml").files
+
+
+def test_credits_are_part_of_what_a_stored_map_is(api: Api) -> None:
+    """Equal layers under another licence are another map: another tag, and never the cached one."""
+    tags = []
+    for env, files in (("bare", {"gate.kml": KML}), ("licensed", {"gate.kml": KML, "LICENSE": LICENSE})):
+        api.post("environments", {"name": env})
+        made = api.upload(env, files).json()
+        kept = {s["name"] for s in api.get(f"environments/{env}/versions/1/sources").json()}
+        assert kept == set(files), "the licence file is kept as a source"
+        assert made["version"] == 1
+        answer = api.get(f"/maps/{env}/kml")
+        tags.append(answer.headers["etag"])
+        assert (MIT in answer.text) == ("LICENSE" in files)
+        report = api.get(f"environments/{env}/versions/1/reports/kml").json()
+        assert report["attribution"] == ([MIT] if "LICENSE" in files else [])
+    assert tags[0] != tags[1]
+    roots = {api.get(f"environments/{env}/versions/1").json()["root"] for env in ("bare", "licensed")}
+    assert len(roots) == 1, "a licence is no layer"
+
+
+def test_every_format_that_is_told_a_credit_still_reads_back() -> None:
+    for name in WITH_A_PLACE:
+        made = offline({"LICENSE": LICENSE, "a.osm": OSM}, name, datum=HERE)
+        groups, _ = formats.group(made.files)
+        assert name in {g.format.name for g in groups}
