@@ -93,6 +93,8 @@ def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, tak
     folders: list[str] = []
     drawn = {i for part in layers.vector("objects").values() for i in part.ids}
     parts = _drawn_together(layers)
+    claimed = {text for part in parts.values() for text in _stated(part)}
+    shared = [text for text in context.attribution if text not in claimed]
     for key in sorted(parts):
         part = parts[key]
         rest: Features | None = part
@@ -102,7 +104,7 @@ def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, tak
         elif key.layer == "topology":
             rest = _undrawn(part, drawn)
         if rest is not None:
-            folders.append(_folder(key, rest, layers, frame))
+            folders.append(_folder(key, rest, layers, frame, shared))
     overlays, pictures = _grids(layers, context, with_pictures, taken)
     # A drawing that is all there is comes back as it was: the datum stands beside what is ours, not inside it.
     datum = [_datum(layers)] if folders or overlays or not documents else []
@@ -284,13 +286,21 @@ def _datum(layers: Layers) -> str:
     )
 
 
-def _folder(key: PartKey, part: Features, layers: Layers, frame: LocalFrame | None) -> str:
-    """A part in our own words."""
+def _stated(part: Features) -> list[Any]:
+    """The licences and credits that a part's own document tells."""
+    said = part.document.get("attribution")
+    return said if isinstance(said, list) else []
+
+
+def _folder(key: PartKey, part: Features, layers: Layers, frame: LocalFrame | None, shared: Sequence[str] = ()) -> str:
+    """A part in our own words. shared: credits that no part's document tells."""
     words = [_data(MARK, "part"), _place_words(key)]
     elevation = layers.elevation(key.level)
     if elevation:
         words.append(_data("elevation", elevation))
     document = part.document if key.name != FAMILY else {}
+    if shared and key.name != FAMILY:
+        document = {**document, "attribution": [*_stated(part), *shared]}
     if document:
         words.append(_data("document", dict(document)))
     title = key.layer if key.level == GROUND else f"{key.layer}, {key.level}"
