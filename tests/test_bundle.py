@@ -222,7 +222,7 @@ def test_template_folder(name: str, below: tuple[str, ...] | None) -> None:
 @pytest.mark.parametrize(
     ("environment", "layers"),
     [
-        ("indoor-agilex-limo-track", {"occupancy"}),
+        ("indoor-agilex-limo-track", {"objects", "occupancy", "resources"}),
         ("riseholme_park_farm_general_east_pathway", {"location", "objects", "topology", "occupancy"}),
         ("riseholme_park_farm_strawberry_polytunnels", {"location", "objects", "topology", "occupancy"}),
         ("riseholme_park_farm_vineyard", {"location", "objects", "topology", "occupancy"}),

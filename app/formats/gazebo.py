@@ -122,7 +122,7 @@ def _lone_models(library: _sdf.Library, models: Sequence[str]) -> dict[str, list
         config = f"{folder}/model.config" if folder else "model.config"
         if config not in library.files or library.model_file(folder) in (name, None):
             chosen.append(name)
-    out = {name: list(_sdf.needed(library, name)) + list(_own_folder(library, name, {})) for name in chosen}
+    out = {name: [*_sdf.needed(library, name), *_own_folder(library, name)] for name in chosen}
     inner = {other for name, others in out.items() for other in others if other != name}
     free = {name: others for name, others in out.items() if name not in inner}
     # Models that include each other all the way round: one of them tells what is wrong.
@@ -142,8 +142,6 @@ def read(files: Files, context: ReadContext) -> Layers:
         said = root.get("version")
         context.warn(f"SDFormat version {said!r} is not one of 1.4 to 1.11: read as 1.7", line=root.sourceline)
     served = _sdf.needed(library, main)
-    if not root.findall("world"):
-        served |= _own_folder(library, main, served)
     reader = _Reader(_sdf.Unfolder(library, served, context), main, {served[n]: files[n] for n in served}, context)
     worlds = root.findall("world")
     for k, world in enumerate(worlds):
@@ -159,16 +157,12 @@ def read(files: Files, context: ReadContext) -> Layers:
     return reader.layers()
 
 
-def _own_folder(library: _sdf.Library, main: str, served: Mapping[str, str]) -> dict[str, str]:
-    """A lone model's own folder, so that what is relative to it resolves: ``models/NAME/…``."""
+def _own_folder(library: _sdf.Library, main: str) -> list[str]:
+    """What lies in a lone model's own folder."""
     folder = main.rpartition("/")[0]
-    if not folder:
-        return {}
-    root = folder.rpartition("/")[0]
-    if main.rpartition("/")[2] != "model.sdf" and f"{folder}/model.config" not in library.files:
-        return {}
-    inside = [n for n in library.inside(folder) if n != main and n not in served]
-    return {n: f"{_sdf.MODELS}/{n[len(root) + 1 :] if root else n}" for n in inside}
+    if not folder or (main.rpartition("/")[2] != "model.sdf" and f"{folder}/model.config" not in library.files):
+        return []
+    return [name for name in library.inside(folder) if name != main]
 
 
 def _key(main: str) -> str:

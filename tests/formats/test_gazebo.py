@@ -241,7 +241,20 @@ def test_a_lone_model_is_a_world_of_one() -> None:
     assert all(use.used for use in found.files.values()), "its model.config goes along"
     out = offline(folder(SAMPLES / "cart"), "gazebo").files
     assert {m.get("name") for m in tree(out).iterchildren("model")} == {"cart", "ground_plane"}
+    assert set(out) == {"world.sdf"}
     assert check(out) == []
+
+
+def test_a_lone_model_keeps_its_meshes() -> None:
+    cube = (SAMPLES / "yard/models/crate/meshes/crate.stl").read_bytes()
+    for uri, served in (("meshes/a.stl", "meshes/a.stl"), ("model://cart/meshes/a.stl", "models/cart/meshes/a.stl")):
+        mesh = f"<collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision>"
+        model = f"<sdf version='1.6'><model name='cart'><link name='l'>{mesh}</link></model></sdf>".encode()
+        files = {"my/cart/model.sdf": model, "my/cart/meshes/a.stl": cube}
+        assert objects(told(files)).properties[0]["shapes"] == [{"type": "mesh", "file": served, "scale": [1, 1, 1]}]
+        out = offline(files, "gazebo").files
+        assert out[served] == cube
+        assert offline(out, "gazebo").files == out
 
 
 # --- poses and frames --------------------------------------------------------------------------------------------
