@@ -260,11 +260,15 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
     groups, belong = _sorted(files, groups)
     out = []
     mains = {main for _, main in groups}
+    names = tuple(sorted(files))
+    speaking = tuple(sorted(main for known, main in groups if known.yields(main)))
+    speakers = {known.name for known, main in groups if known.yields(main)}
     yielding = {
         other
         for known, main in groups
-        for other in known.companions(main, files[main], sorted(mains))
-        if other != main and known.yields(other) and not known.yields(main)
+        if known.name in speakers and not known.yields(main)
+        for other in known.companions(main, files[main], speaking)
+        if known.yields(other)
     }
     groups = [(known, main) for known, main in groups if main not in yielding]
     mains -= yielding
@@ -273,7 +277,7 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
         if known.joined:
             joined.setdefault((known.name, main.rpartition("/")[0]), []).append(main)
     for known, main in groups:
-        more = belong[main] if main in belong else known.companions(main, files[main], sorted(files))
+        more = belong[main] if main in belong else known.companions(main, files[main], names)
         others = [n for n in more if n in files and n not in mains]
         if known.joined:
             first, *further = joined[known.name, main.rpartition("/")[0]]
@@ -282,7 +286,7 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
             others += further
         used.update([main, *others])
         own = {n: files[n] for n in [main, *others]}
-        seen = {n: files[n] for n in known.looks_at(main, sorted(files)) if n in files and n not in own}
+        seen = {n: files[n] for n in known.looks_at(main, names) if n in files and n not in own}
         out.append(Group(known, main, own, seen))
     return out, sorted(set(files) - used)
 

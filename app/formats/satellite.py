@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -145,9 +146,7 @@ def _world_end(name: str) -> str | None:
 def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
     """Of a world file its picture, of a picture its world file; with the .prj and .aux.xml beside the two."""
     del data
-    known: dict[str, str] = {}
-    for name in names:
-        known.setdefault(name.lower(), name)
+    known = _by_lower(tuple(names))
     lower = main.lower()
     stem = lower.rpartition(".")[0]
     end = _world_end(main)
@@ -160,6 +159,16 @@ def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
         wanted = [world for w in mine for world in (stem + w, lower + "w") if world in known][:1]
     wanted += [stem + ".prj", stem + ".aux.xml"] + ([picture + ".aux.xml"] if picture else [])
     return [known[n] for n in dict.fromkeys(wanted) if n in known and known[n] != main]
+
+
+@lru_cache(maxsize=4)
+def _by_lower(names: tuple[str, ...]) -> dict[str, str]:
+    """Names by their small letters, the first of those that differ in nothing else; kept, since every picture of an
+    upload asks for the same."""
+    known: dict[str, str] = {}
+    for name in names:
+        known.setdefault(name.lower(), name)
+    return known
 
 
 # --- reading ------------------------------------------------------------------------------------------------------

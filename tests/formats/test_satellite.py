@@ -8,6 +8,7 @@ import math
 import shutil
 import struct
 import subprocess
+import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -679,3 +680,21 @@ def test_resampled_is_the_same_function_for_everybody() -> None:
     made = written(utm((8, 8, 1)), crs="wgs84")[0]["satellite.tif"]
     direct = resampled(utm((8, 8, 1)), crs="EPSG:4326")
     assert np.array_equal(read({"a.tif": made})[0].pixels, direct.pixels)
+
+
+def test_many_pictures_of_one_upload_are_sorted_in_time() -> None:
+    lone, placed_itself = image(), (SAMPLES / "orchard.tif").read_bytes()
+    files: dict[str, bytes] = {}
+    for k in range(2000):
+        files |= {
+            f"{k}.png": lone,
+            f"{k}.pgw": b"1 0 0 -1 0 0",
+            f"t{k}.tif": placed_itself,
+            f"t{k}.tfw": b"1 0 0 -1 0 0",
+        }
+    start = time.monotonic()
+    groups, rest = formats.group(files)
+    assert time.monotonic() - start < 10.0
+    assert len(groups) == 4000
+    assert rest == []
+    assert all(len(g.files) == 2 for g in groups)
