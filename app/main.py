@@ -38,6 +38,7 @@ from app.api import (
     maps,
     openapi,
     problems,
+    provenance,
     tokens,
     transform,
     versions,
@@ -126,6 +127,7 @@ def create_app(settings: Settings) -> Server:
         convert,
         events,
         manifest,
+        provenance,
         jobs,
         tokens,
     ):

@@ -410,6 +410,17 @@ class DerivationOut(BaseModel):
     parameters: list[dict[str, Any]]
 
 
+class ProvenanceOut(BaseModel):
+    """Which file made which layer, and which map is made of them; ``links`` lead from id to id."""
+
+    environment: str
+    version: int
+    sources: list[dict[str, Any]]
+    parts: list[dict[str, Any]]
+    maps: list[dict[str, Any]]
+    links: list[dict[str, str]]
+
+
 class KeyOut(BaseModel):
     """A public key; bytes in base64."""
 

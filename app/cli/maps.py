@@ -222,6 +222,9 @@ def list_formats(as_json: options.Json = False) -> None:
 def coverage(
     environment: Annotated[str, typer.Argument(help="Name of the environment.")],
     version: options.Version = "latest",
+    picture: Annotated[
+        str | None, typer.Option("--picture", help="Write an SVG picture of which file makes which map.")
+    ] = None,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
@@ -230,6 +233,13 @@ def coverage(
 
     Directly, by deriving, or not yet: then with what to supply.
     """
+    if picture is not None:
+        with Client(server, token) as client:
+            address = path_of("environments", environment, "versions", version, "provenance")
+            with client.download(address, {}) as got:
+                written = _store(got, picture)
+        output.say(f"wrote {', '.join(written)}")
+        return
     with Client(server, token) as client:
         rows = client.get(path_of("environments", environment, "versions", version, "maps"))
     if as_json:
@@ -377,7 +387,10 @@ def _step(step: Any) -> str:
     if not isinstance(step, Mapping):
         return str(step)
     name = str(step.get("step") or step.get("method") or step.get("name") or "?")
-    return f"{step['from']} to {step['to']} ({name})" if "from" in step and "to" in step else name
+    if "from" not in step or "to" not in step:
+        return name
+    start = step["from"] if isinstance(step["from"], str) else " and ".join(step["from"])
+    return f"{start} to {step['to']} ({name})"
 
 
 def _layer(text: str | None) -> Any:

@@ -25,7 +25,7 @@ from app.errors import (
 )
 from app.formats import Limits
 from app.model.frame import Datum
-from app.model.layers import Layers
+from app.model.layers import Layers, PartKey
 from app.pool import WorkerDied
 from app.store import Store
 from app.store.values import Version
@@ -143,6 +143,13 @@ class Maps:
                 line["chain"] = [step.as_dict() for step in way.steps]
             out.append(line)
         return out
+
+    def parts_of(self, version: Version, name: str) -> tuple[PartKey, ...]:
+        """The stored parts that a format's map would be made of; empty where it cannot be made."""
+        try:
+            return self._way(version, formats.get_format(name), recipes.stock(version)).keys
+        except FleetMapError:
+            return ()
 
     def _way(self, version: Version, known: formats.Format, available: recipes.Stock) -> recipes.Chain:
         """The cheapest chain whose derivations work on what is stored, found by doing them once for each content."""

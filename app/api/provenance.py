@@ -1,0 +1,176 @@
+"""Where a version's content comes from, as a picture: which file made which layer, and which map is made of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+from xml.sax.saxutils import escape
+
+from fastapi import APIRouter, Request
+from starlette.responses import Response
+
+from app.api.access import Viewer
+from app.api.answers import Route, answer
+from app.api.maps import number_of
+from app.api.schemas import EnvironmentPath, ProvenanceOut, VersionPath, told
+from app.api.services import Here
+from app.convert import Maps
+from app.store.values import Version
+
+router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"], route_class=Route)
+
+ROW, WIDTH, GAP, TOP = 34, 250, 130, 60
+COLOURS = {
+    "raw": "#dceefb",
+    "derived": "#fdf1d3",
+    "generated": "#efe3fb",
+    "template": "#eeeeee",
+    "missing": "#f6f6f6",
+    "stale": "#fbd9d5",
+}
+
+
+def graph(maps: Maps, version: Version) -> dict[str, Any]:
+    """``{sources, parts, maps, links}``: names of files, parts with how they came, formats with their state, and what
+    leads to what (``from``, ``to``: ids of these)."""
+    stale = version.stale
+    links: list[dict[str, str]] = []
+    parts = []
+    for entry in version.parts:
+        if not entry.count:
+            continue
+        key, told_by = entry.key, entry.provenance
+        name = f"part:{key.layer}/{key.level}/{key.name}"
+        parts.append(
+            {
+                "id": name,
+                "layer": key.layer,
+                "level": key.level,
+                "name": key.name,
+                "information": told_by.information,
+                "steps": [str(step.get("step", "")) for step in told_by.steps],
+                "stale": list(stale.get(key, ())),
+            }
+        )
+        inputs = [line for line in told_by.inputs if "layer" in line]
+        links += [{"from": f"part:{line['layer']}/{line['level']}/{line['name']}", "to": name} for line in inputs]
+        if not inputs:
+            links += [{"from": f"source:{source}", "to": name} for source in told_by.sources]
+    known = {part["id"] for part in parts}
+    made = []
+    for line in maps.coverage(version):
+        name = f"map:{line['format']}"
+        made.append({"id": name, "format": line["format"], "state": line["state"], "chain": line["chain"]})
+        if line["state"] == "missing":
+            continue
+        used = maps.parts_of(version, line["format"])
+        links += [
+            {"from": f"part:{k.layer}/{k.level}/{k.name}", "to": name}
+            for k in used
+            if f"part:{k.layer}/{k.level}/{k.name}" in known
+        ]
+    named = {link["from"] for link in links if link["from"].startswith("source:")}
+    sources = [{"id": f"source:{s.name}", "name": s.name, "used": s.used} for s in version.sources]
+    have = {s["id"] for s in sources}
+    sources += [{"id": name, "name": name.partition(":")[2], "used": True} for name in sorted(named - have)]
+    return {"sources": sources, "parts": parts, "maps": made, "links": links}
+
+
+@dataclass(slots=True)
+class _Box:
+    x: float
+    y: float
+    text: str
+    note: str
+    colour: str
+    title: str = ""
+    lines: list[str] = field(default_factory=list)
+
+
+def svg(told_graph: dict[str, Any], title: str) -> bytes:
+    """The graph as an SVG picture: files on the left, layers in the middle, maps on the right; stale ones in red."""
+    boxes: dict[str, _Box] = {}
+    columns = [
+        [
+            (s["id"], s["name"].rpartition("/")[2], "" if s["used"] else "kept, not used", "raw", s["name"])
+            for s in told_graph["sources"]
+        ],
+        [
+            (
+                p["id"],
+                f"{p['layer']}: {p['name']}" + ("" if p["level"] == "ground" else f" ({p['level']})"),
+                "stale: " + ", ".join(p["stale"]) if p["stale"] else ", ".join(filter(None, p["steps"])),
+                "stale" if p["stale"] else p["information"],
+                p["information"],
+            )
+            for p in told_graph["parts"]
+        ],
+        [
+            (m["id"], m["format"], ", ".join(step["step"] for step in m["chain"]), _state(m["state"]), m["state"])
+            for m in told_graph["maps"]
+        ],
+    ]
+    for column, rows in enumerate(columns):
+        for row, (name, text, note, colour, full) in enumerate(rows):
+            x, y = 20 + column * (WIDTH + GAP), TOP + row * ROW
+            boxes[name] = _Box(x, y, text, note, COLOURS[colour], full)
+    height = TOP + ROW * max((len(rows) for rows in columns), default=1) + 20
+    width = 20 + 3 * WIDTH + 2 * GAP + 20
+    out = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
+        'font-family="sans-serif" font-size="12">',
+        f"<title>{escape(title)}</title>",
+        f'<rect width="{width}" height="{height}" fill="white"/>',
+    ]
+    for column, heading in enumerate(("files", "layers", "maps")):
+        out.append(f'<text x="{20 + column * (WIDTH + GAP)}" y="35" font-size="15">{heading}</text>')
+    for link in told_graph["links"]:
+        a, b = boxes.get(link["from"]), boxes.get(link["to"])
+        if a is None or b is None:
+            continue
+        same = a.x == b.x
+        x1, y1, y2 = a.x + WIDTH, a.y + 13, b.y + 13
+        x2 = b.x + WIDTH if same else b.x
+        bend = 60 if same else GAP / 2
+        x3 = x2 + bend if same else x2 - bend
+        red = b.colour == COLOURS["stale"]
+        stroke = "#c0392b" if red else "#9aa5b1"
+        out.append(
+            f'<path d="M{x1} {y1} C{x1 + bend} {y1} {x3} {y2} {x2} {y2}" fill="none" stroke="{stroke}" '
+            f'stroke-width="1"{" stroke-dasharray=" + chr(34) + "4 3" + chr(34) if red else ""}/>'
+        )
+    for box in boxes.values():
+        out.append(
+            f'<g><title>{escape(box.title)}</title><rect x="{box.x}" y="{box.y}" width="{WIDTH}" height="27" rx="4" '
+            f'fill="{box.colour}" stroke="#7b8794"/><text x="{box.x + 8}" y="{box.y + (12 if box.note else 18)}">'
+            f"{escape(_short(box.text, 38))}</text>"
+        )
+        if box.note:
+            note = escape(_short(box.note, 46))
+            out.append(f'<text x="{box.x + 8}" y="{box.y + 23}" font-size="9" fill="#52606d">{note}</text>')
+        out.append("</g>")
+    out.append("</svg>")
+    return "\n".join(out).encode()
+
+
+def _state(state: str) -> str:
+    return {"direct": "raw", "derivable": "derived"}.get(state, "missing")
+
+
+def _short(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+@router.get(
+    "/provenance",
+    responses={**told(ProvenanceOut, 404), 200: {"model": ProvenanceOut, "content": {"image/svg+xml": {}}}},
+    summary="Which file made which map",
+)
+def provenance(env: EnvironmentPath, v: VersionPath, request: Request, here: Here, _: Viewer) -> Response:
+    """An SVG picture, or the same as JSON with `Accept: application/json`. What is stale is marked."""
+    version = here.store.version(env, number_of(v))
+    found = graph(here.maps, version)
+    if "application/json" in request.headers.get("accept", ""):
+        return answer({"environment": env, "version": version.number, **found})
+    picture = svg(found, f"{env}, version {version.number}")
+    return Response(picture, media_type="image/svg+xml", headers={"content-security-policy": "default-src 'none'"})
