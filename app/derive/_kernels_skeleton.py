@@ -1,0 +1,545 @@
+"""The skeleton of a mask and the graph in it, as native code.
+
+Thinning is that of Zhang and Suen (A fast parallel algorithm for thinning digital patterns, CACM 27, 1984), but each
+round looks only at cells whose neighbourhood has changed: the result is the same, cell for cell, at a fraction of the
+work. A block of 2 × 2 cells, which their rules delete altogether, keeps one cell, so that the skeleton has as many
+pieces and holes as the mask (pieces: 8-connected).
+
+Masks are [height, width] with a border of zeros; cells of the skeleton are listed by row and column, and paths hold
+places in that list.
+"""
+
+# numba has its own types for numbers: 64-bit integers and floats, whatever mypy makes of NumPy's.
+# mypy: disable-error-code="assignment,return-value,arg-type,no-any-return"
+
+from __future__ import annotations
+
+import numpy as np
+
+from app.derive._kernels_space import F64, I32, I64, U8, U16, clear, distance2, gaps
+from app.derive._native import native
+
+Graph = tuple[I64, I64, I64, I64, I64]
+
+_DY = np.array([-1, -1, 0, 1, 1, 1, 0, -1], np.int64)
+_DX = np.array([0, 1, 1, 1, 0, -1, -1, -1], np.int64)
+"""The eight neighbours, clockwise from the row above: bit k of a neighbourhood's code stands for neighbour k."""
+
+
+def _tables() -> tuple[U8, U8]:
+    """By code of a neighbourhood: bit 1 and 2 whether the first and second pass delete; whether a cell is redundant."""
+    passes, redundant = np.zeros(256, np.uint8), np.zeros(256, np.uint8)
+    for code in range(256):
+        p = [code >> k & 1 for k in range(8)]
+        north, east, south, west = p[0], p[2], p[4], p[6]
+        rises = sum(p[k] == 0 and p[(k + 1) % 8] == 1 for k in range(8))
+        if 2 <= sum(p) <= 6 and rises == 1:
+            if not (north and east and south) and not (east and south and west):
+                passes[code] |= 1
+            if not (north and east and west) and not (north and south and west):
+                passes[code] |= 2
+        # Yokoi's number: how many 8-connected pieces the neighbours would fall into; an end (one neighbour) stays.
+        q = [1 - v for v in p]
+        pieces = sum(q[k] - q[k] * q[(k + 1) % 8] * q[(k + 2) % 8] for k in (0, 2, 4, 6))
+        redundant[code] = sum(p) >= 2 and pieces == 1
+    return passes, redundant
+
+
+_PASSES, _REDUNDANT = _tables()
+_BLOCK = 4 | 8 | 16
+"""The neighbourhood of the upper left cell of a 2 × 2 block: east, south-east and south."""
+
+
+@native
+def _code(mask: U8, y: int, x: int) -> int:
+    code = 0
+    for k in range(8):
+        code |= (mask[y + _DY[k], x + _DX[k]] & 1) << k
+    return code
+
+
+@native
+def _lone_block(mask: U8, y: int, x: int) -> bool:
+    """Whether the 2 × 2 cells from (y, x) on have no neighbours (those of (y, x) itself are known)."""
+    height, width = mask.shape
+    for j in range(-1, 3):
+        for i in range(-1, 3):
+            inside = 0 <= j <= 1 and 0 <= i <= 1
+            v, u = y + j, x + i
+            if not inside and v < height and u < width and mask[v, u] & 1:
+                return False
+    return True
+
+
+@native
+def thin(mask: U8) -> int:
+    """Thin a mask of zeros and ones in place, to lines one cell wide; how many cells are left."""
+    height, width = mask.shape
+    flat = mask.ravel()
+    count = 0
+    edge = 0
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            if mask[y, x]:
+                count += 1
+                if not (mask[y - 1, x] and mask[y + 1, x] and mask[y, x - 1] and mask[y, x + 1]):
+                    edge += 1
+    size = max(1024, edge * 2)
+    first, second = np.empty(size, np.int32), np.empty(size, np.int32)
+    gone = np.empty(size, np.int32)
+    n1 = n2 = 0
+    # Cells whose only missing neighbours are diagonal cannot be deleted yet: they have seven.
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            if mask[y, x] and not (mask[y - 1, x] and mask[y + 1, x] and mask[y, x - 1] and mask[y, x + 1]):
+                first[n1] = second[n2] = y * width + x
+                n1 += 1
+                n2 += 1
+                mask[y, x] |= 6
+    step = np.empty(8, np.int64)
+    for k in range(8):
+        step[k] = _DY[k] * width + _DX[k]
+    bit = 1
+    while n1 > 0 or n2 > 0:
+        deleted = 0
+        keep = 255 - 2 * bit
+        for i in range(n1):
+            cell = first[i]
+            flat[cell] &= keep
+            if flat[cell] & 1 == 0:
+                continue
+            code = 0
+            for k in range(8):
+                code |= (flat[cell + step[k]] & 1) << k
+            if _PASSES[code] & bit and not (code == _BLOCK and _lone_block(mask, cell // width, cell % width)):
+                gone[deleted] = cell
+                deleted += 1
+        n1 = 0
+        for i in range(deleted):
+            flat[gone[i]] &= 6
+        count -= deleted
+        need = max(n2, 0) + 8 * deleted
+        if need > len(second):
+            second = _grown(second, n2, need)
+        if 8 * deleted > len(first):
+            first = _grown(first, 0, 8 * deleted)
+        for i in range(deleted):
+            cell = gone[i]
+            for k in range(8):
+                other = cell + step[k]
+                value = flat[other]
+                if value & 1:
+                    if value & (2 * bit) == 0:
+                        first[n1] = other
+                        n1 += 1
+                    if value & (6 - 2 * bit) == 0:
+                        second[n2] = other
+                        n2 += 1
+                    flat[other] = 7
+        first, second = second, first
+        n1, n2 = n2, n1
+        if n1 > len(gone):
+            gone = np.empty(len(first), np.int32)
+        bit = 3 - bit
+    # What is left of steps: cells that can go without cutting anything.
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            if mask[y, x]:
+                if _REDUNDANT[_code(mask, y, x)]:
+                    mask[y, x] = 0
+                    count -= 1
+                else:
+                    mask[y, x] = 1
+    return count
+
+
+@native
+def _grown(array: I32, used: int, need: int) -> I32:
+    out = np.empty(max(need, 2 * len(array)), np.int32)
+    out[:used] = array[:used]
+    return out
+
+
+@native
+def listed(mask: U8, cells: I32, rows: I64) -> None:
+    """The set cells as [n, 2] row and column, and where each row begins in that list ([height + 1])."""
+    height, width = mask.shape
+    n = 0
+    for y in range(height):
+        rows[y] = n
+        for x in range(width):
+            if mask[y, x]:
+                cells[n, 0], cells[n, 1] = y, x
+                n += 1
+    rows[height] = n
+
+
+@native
+def _find(cells: I32, rows: I64, y: int, x: int) -> int:
+    low, high = rows[y], rows[y + 1]
+    while low < high:
+        middle = (low + high) // 2
+        if cells[middle, 1] < x:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@native
+def _neighbours(mask: U8, cells: I32, rows: I64, k: int, out: I64) -> int:
+    y, x = cells[k, 0], cells[k, 1]
+    n = 0
+    for d in range(8):
+        v, u = y + _DY[d], x + _DX[d]
+        if mask[v, u]:
+            out[n] = _find(cells, rows, v, u)
+            n += 1
+    return n
+
+
+@native
+def trace(mask: U8, cells: I32, rows: I64) -> Graph:
+    """The graph of a skeleton: (nodes, start, end, begin, path).
+
+    nodes: the cells that have other than two neighbours, and one cell of each ring. start, end: places of nodes for
+    each edge. Edge e runs over the cells ``path[begin[e] : begin[e + 1]]``, each next to the one before, the nodes'
+    own cells included.
+    """
+    n = len(cells)
+    near, other = np.empty(8, np.int64), np.empty(8, np.int64)
+    degree = np.empty(n, np.int64)
+    node = np.full(n, -1, np.int64)
+    nodes = np.empty(n, np.int64)
+    count = ends = 0
+    for k in range(n):
+        degree[k] = _neighbours(mask, cells, rows, k, near)
+        if degree[k] != 2:
+            node[k] = count
+            nodes[count] = k
+            count += 1
+            ends += degree[k]
+    rings = n // 4 + 1
+    start, end = np.empty(ends + rings, np.int64), np.empty(ends + rings, np.int64)
+    begin = np.empty(ends + rings + 1, np.int64)
+    path = np.empty(n + 2 * (ends + rings), np.int64)
+    done = np.zeros(n, np.uint8)
+    edges = used = 0
+    for phase in range(2):
+        for k in range(n):
+            if phase == 0:
+                if node[k] < 0:
+                    continue
+            else:  # rings, which no node has led to
+                if node[k] >= 0 or done[k]:
+                    continue
+                node[k] = count
+                nodes[count] = k
+                count += 1
+            m = _neighbours(mask, cells, rows, k, near)
+            for d in range(m if phase == 0 else 1):
+                q = near[d]
+                if (node[q] >= 0 and q < k) or done[q]:
+                    continue
+                begin[edges] = used
+                path[used] = k
+                used += 1
+                previous, here = k, q
+                while node[here] < 0:
+                    done[here] = 1
+                    path[used] = here
+                    used += 1
+                    _neighbours(mask, cells, rows, here, other)
+                    following = other[0] if other[0] != previous else other[1]
+                    previous, here = here, following
+                path[used] = here
+                used += 1
+                if here == k and used - begin[edges] < 5:
+                    used = begin[edges]  # two cells beside a junction, around nothing
+                    continue
+                start[edges], end[edges] = node[k], node[here]
+                edges += 1
+    begin[edges] = used
+    return nodes[:count].copy(), start[:edges].copy(), end[:edges].copy(), begin[: edges + 1].copy(), path[:used].copy()
+
+
+@native
+def _incidence(count: int, start: I64, end: I64, alive: U8) -> tuple[I64, I64]:
+    """The edges at each node: those of node v are ``edges[first[v] : first[v + 1]]`` (a loop stands there twice)."""
+    first = np.zeros(count + 1, np.int64)
+    for e in range(len(start)):
+        if alive[e]:
+            first[start[e] + 1] += 1
+            first[end[e] + 1] += 1
+    for v in range(count):
+        first[v + 1] += first[v]
+    at = first[:-1].copy()
+    edges = np.empty(first[count], np.int64)
+    for e in range(len(start)):
+        if alive[e]:
+            edges[at[start[e]]] = e
+            at[start[e]] += 1
+            edges[at[end[e]]] = e
+            at[end[e]] += 1
+    return first, edges
+
+
+@native
+def _lengths(cells: I32, begin: I64, path: I64) -> F64:
+    out = np.zeros(len(begin) - 1)
+    for e in range(len(out)):
+        for i in range(begin[e], begin[e + 1] - 1):
+            a, b = path[i], path[i + 1]
+            straight = cells[a, 0] == cells[b, 0] or cells[a, 1] == cells[b, 1]
+            out[e] += 1.0 if straight else np.sqrt(2.0)
+    return out
+
+
+@native
+def contract(graph: Graph, gap: U16, cells: I32, radius: float) -> Graph:
+    """One junction where several lie within ``radius`` cells of each other along the skeleton.
+
+    The one farthest from obstacles stays, and edges of the others are led on to it over the cells between. Loops that
+    arise and are not longer than four times the radius go, since they lead nowhere.
+    """
+    nodes, start, end, begin, path = graph
+    count, edges = len(nodes), len(start)
+    length = _lengths(cells, begin, path)
+    first, at = _incidence(count, start, end, np.ones(edges, np.uint8))
+    clearance = np.empty(count, np.int64)
+    for v in range(count):
+        clearance[v] = distance2(gap, cells[nodes[v], 0], cells[nodes[v], 1])
+    order = np.argsort(-clearance, kind="mergesort")
+    head = np.full(count, -1, np.int64)
+    via = np.full(count, -1, np.int64)  # the edge towards the head
+    away = np.zeros(count)
+    queue = np.empty(count, np.int64)
+    for rank in range(count):
+        v = order[rank]
+        if head[v] >= 0:
+            continue
+        head[v] = v
+        queue[0] = v
+        size, i = 1, 0
+        while i < size and first[v + 1] - first[v] > 2:
+            here = queue[i]
+            i += 1
+            for k in range(first[here], first[here + 1]):
+                e = at[k]
+                u = end[e] if start[e] == here else start[e]
+                far = away[here] + length[e]
+                if head[u] < 0 and far <= radius and first[u + 1] - first[u] > 2:
+                    head[u], via[u], away[u] = v, e, far
+                    queue[size] = u
+                    size += 1
+    kept = np.zeros(edges, np.uint8)
+    room = m = 0
+    for e in range(edges):
+        a, b = start[e], end[e]
+        tree = via[a] == e or via[b] == e
+        if tree or (head[a] == head[b] and length[e] + away[a] + away[b] <= 4.0 * radius):
+            continue
+        kept[e] = 1
+        m += 1
+        room += begin[e + 1] - begin[e]
+        for v0 in (a, b):
+            v = v0
+            while via[v] >= 0:
+                room += begin[via[v] + 1] - begin[via[v]]
+                v = end[via[v]] if start[via[v]] == v else start[via[v]]
+    place = np.full(count, -1, np.int64)
+    new_nodes = np.empty(count, np.int64)
+    n = 0
+    for v in range(count):
+        if head[v] == v:
+            place[v] = n
+            new_nodes[n] = nodes[v]
+            n += 1
+    new_start, new_end, new_begin = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m + 1, np.int64)
+    new_path = np.empty(room, np.int64)
+    used = m = 0
+    for e in range(edges):
+        if not kept[e]:
+            continue
+        a, b = start[e], end[e]
+        new_start[m], new_end[m], new_begin[m] = place[head[a]], place[head[b]], used
+        used = _onwards(a, start, end, begin, path, via, new_path, used)
+        i, j = new_begin[m], used - 1
+        while i < j:
+            new_path[i], new_path[j] = new_path[j], new_path[i]
+            i += 1
+            j -= 1
+        for i in range(begin[e], begin[e + 1]):
+            new_path[used] = path[i]
+            used += 1
+        used = _onwards(b, start, end, begin, path, via, new_path, used)
+        m += 1
+    new_begin[m] = used
+    return new_nodes[:n].copy(), new_start, new_end, new_begin, new_path[:used].copy()
+
+
+@native
+def _onwards(v: int, start: I64, end: I64, begin: I64, path: I64, via: I64, out: I64, used: int) -> int:
+    """Append the cells from node v, without its own, to its head."""
+    while via[v] >= 0:
+        e = via[v]
+        low, high = begin[e], begin[e + 1] - 1
+        forward = start[e] == v
+        for i in range(1, high - low + 1):
+            out[used] = path[low + i] if forward else path[high - i]
+            used += 1
+        v = end[e] if forward else start[e]
+    return used
+
+
+@native
+def prune(graph: Graph, gap: U16, cells: I32, spur: float) -> U8:
+    """Which edges stay when dead ends go that reach less than ``spur`` cells beyond the free circle of their junction.
+
+    Shortest first, one at a junction at a time; what had three branches has two then, and counts as a line.
+    """
+    nodes, start, end, begin, path = graph
+    count, edges = len(nodes), len(start)
+    length = _lengths(cells, begin, path)
+    alive = np.ones(edges, np.uint8)
+    best = np.empty(count)
+    leaf = np.empty(count, np.int64)
+    clearance = np.empty(count)
+    for v in range(count):
+        clearance[v] = np.sqrt(distance2(gap, cells[nodes[v], 0], cells[nodes[v], 1]))
+    while True:
+        first, at = _incidence(count, start, end, alive)
+        best[:] = np.inf
+        leaf[:] = -1
+        for tip in range(count):
+            if first[tip + 1] - first[tip] != 1:
+                continue
+            here, e, far = tip, at[first[tip]], 0.0
+            while True:
+                far += length[e]
+                here = end[e] if start[e] == here else start[e]
+                if first[here + 1] - first[here] != 2:
+                    break
+                e = at[first[here]] if at[first[here]] != e else at[first[here] + 1]
+            if first[here + 1] - first[here] < 3:
+                continue
+            beyond = far - max(0.0, clearance[here] - clearance[tip])
+            if beyond < spur and (beyond < best[here] or (beyond == best[here] and tip < leaf[here])):
+                best[here], leaf[here] = beyond, tip
+        found = False
+        for junction in range(count):
+            tip = leaf[junction]
+            if tip < 0:
+                continue
+            found = True
+            here, e = tip, at[first[tip]]
+            while True:
+                alive[e] = 0
+                here = end[e] if start[e] == here else start[e]
+                if here == junction:
+                    break
+                e = at[first[here]] if at[first[here]] != e else at[first[here] + 1]
+        if not found:
+            return alive
+
+
+@native
+def chains(graph: Graph, alive: U8) -> tuple[I64, I64, I64]:
+    """The lines between junctions and ends: (lone, begin, path).
+
+    lone: cells of nodes without edges that never had any. Line c runs over the cells ``path[begin[c] : begin[c + 1]]``;
+    a ring without junctions begins and ends at one of its cells.
+    """
+    nodes, start, end, begin, path = graph
+    count, edges = len(nodes), len(start)
+    first, at = _incidence(count, start, end, alive)
+    had, _ = _incidence(count, start, end, np.ones(edges, np.uint8))
+    lone = np.empty(count, np.int64)
+    alone = 0
+    for v in range(count):
+        if had[v + 1] == had[v]:
+            lone[alone] = nodes[v]
+            alone += 1
+    done = np.zeros(edges, np.uint8)
+    out_begin, out = np.empty(edges + 1, np.int64), np.empty(len(path), np.int64)
+    lines = used = 0
+    for phase in range(2):
+        for v in range(count):
+            degree = first[v + 1] - first[v]
+            if phase == 0 and degree == 2:
+                continue
+            for k in range(first[v], first[v + 1]):
+                e = at[k]
+                if done[e]:
+                    continue
+                out_begin[lines] = used
+                lines += 1
+                here = v
+                out[used] = nodes[v]
+                used += 1
+                while True:
+                    done[e] = 1
+                    low, high = begin[e], begin[e + 1] - 1
+                    forward = start[e] == here
+                    for i in range(1, high - low + 1):
+                        out[used] = path[low + i] if forward else path[high - i]
+                        used += 1
+                    here = end[e] if forward else start[e]
+                    if first[here + 1] - first[here] != 2 or here == v:
+                        break
+                    e = at[first[here]] if at[first[here]] != e else at[first[here] + 1]
+    out_begin[lines] = used
+    return lone[:alone].copy(), out_begin[: lines + 1].copy(), out[:used].copy()
+
+
+@native
+def simplify(mask: U8, cells: I32, begin: I64, path: I64, tolerance: float, keep: U8) -> None:
+    """Mark in ``keep`` (one for each place in ``path``) the corners of straight lines that replace each line.
+
+    As Douglas and Peucker do it, but a straight line must also stay in the mask; it deviates by ``tolerance`` cells at
+    most. Steps between neighbouring cells of the mask always may stay, so this always ends.
+    """
+    stack = np.empty((len(path) + 2, 2), np.int64)
+    for c in range(len(begin) - 1):
+        low, high = begin[c], begin[c + 1] - 1
+        keep[low] = keep[high] = 1
+        stack[0, 0], stack[0, 1] = low, high
+        size = 1
+        while size > 0:
+            size -= 1
+            i, j = stack[size, 0], stack[size, 1]
+            if j - i < 2:
+                continue
+            y0, x0 = np.int64(cells[path[i], 0]), np.int64(cells[path[i], 1])
+            y1, x1 = np.int64(cells[path[j], 0]), np.int64(cells[path[j], 1])
+            dy, dx = y1 - y0, x1 - x0
+            along = dy * dy + dx * dx
+            worst, where = -1.0, (i + j) // 2
+            for k in range(i + 1, j):
+                v, u = cells[path[k], 0] - y0, cells[path[k], 1] - x0
+                t = 0.0
+                if along > 0:
+                    t = min(1.0, max(0.0, (v * dy + u * dx) / along))
+                away = (v - t * dy) ** 2 + (u - t * dx) ** 2
+                if away > worst:
+                    worst, where = away, k
+            if along > 0 and worst <= tolerance * tolerance and clear(mask, y0, x0, y1, x1):
+                continue
+            keep[where] = 1
+            stack[size, 0], stack[size, 1] = i, where
+            stack[size + 1, 0], stack[size + 1, 1] = where, j
+            size += 2
+
+
+def compile_all() -> None:
+    """Call every kernel once on a tiny grid."""
+    mask = np.zeros((7, 9), np.uint8)
+    mask[1:-1, 1:-1] = 1
+    gap = np.zeros(mask.shape, np.uint16)
+    gaps(mask, gap)
+    thinned = mask.copy()
+    cells, rows = np.empty((thin(thinned), 2), np.int32), np.empty(len(mask) + 1, np.int64)
+    listed(thinned, cells, rows)
+    graph = contract(trace(thinned, cells, rows), gap, cells, 1.0)
+    _, begin, path = chains(graph, prune(graph, gap, cells, 1.0))
+    simplify(mask, cells, begin, path, 1.0, np.zeros(len(path), np.uint8))

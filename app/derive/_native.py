@@ -1,0 +1,129 @@
+"""Functions compiled to native code by numba, kept compiled between processes.
+
+Compiling takes seconds, loading what was compiled milliseconds. Worker processes may not write (``app.sandbox``), so
+the folder is filled by a process that only compiles (``fill``) and reads nothing; where nothing can be read or written,
+a function is compiled in memory: a folder never makes a derivation fail. numba is imported with the first kernel, so
+that starting the server does not pay for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import os
+import pkgutil
+import platform
+import shutil
+import tempfile
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar, cast
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+FOLDER = "NUMBA_CACHE_DIR"
+"""numba's own variable for the folder; without it the user's cache folder is taken."""
+
+_KERNELS = "_kernels_"
+"""Modules of this name hold kernels and nothing else; they are imported when first needed."""
+
+
+def folder() -> Path:
+    """Where compiled code of this release, machine and user is kept; it need not exist."""
+    said = os.environ.get(FOLDER)
+    base = Path(said) if said else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fleetmap"
+    return base / _key()
+
+
+def native(function: F) -> F:
+    """The function as native code that holds no lock; compiled when first called, or loaded from the folder."""
+    import numba
+
+    compiled: Any = numba.njit(nogil=True)(function)
+    with contextlib.suppress(Exception):  # another numba may look otherwise inside: then without a folder
+        compiled._cache = _cache(function)
+    return cast(F, compiled)
+
+
+def fill(where: Path) -> None:
+    """Compile all kernels into ``where`` (what ``NUMBA_CACHE_DIR`` names), unless this was done before.
+
+    It never reads what stands there, and the new folder appears in one step: nothing half-written is ever loaded.
+    """
+    target = where / _key()
+    if target.is_dir():
+        return
+    where.mkdir(parents=True, exist_ok=True)
+    for old in where.iterdir():  # of other releases
+        shutil.rmtree(old, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=where) as scratch:
+        os.environ[FOLDER] = scratch
+        for module in _modules():
+            importlib.import_module(module).compile_all()
+        made = Path(scratch) / _key()
+        if made.is_dir():
+            with contextlib.suppress(OSError):  # another process was quicker
+                made.rename(target)
+
+
+def fill_quietly(where: Path) -> None:
+    """``fill`` for a process of its own: politely, and without a word where it cannot be done."""
+    with contextlib.suppress(Exception):
+        os.nice(10)
+        fill(where)
+
+
+def _modules() -> list[str]:
+    package = __name__.rpartition(".")[0]
+    path = [str(Path(__file__).parent)]
+    return sorted(f"{package}.{m.name}" for m in pkgutil.iter_modules(path) if m.name.startswith(_KERNELS))
+
+
+def _key() -> str:
+    """A name for what compiled code depends on besides the processor, which numba itself looks at."""
+    digest = hashlib.blake2b(digest_size=8)
+    for file in sorted(Path(__file__).parent.glob(f"{_KERNELS}*.py")):
+        digest.update(file.read_bytes())
+    parts = (metadata.version("numba"), metadata.version("numpy"), platform.python_version(), platform.machine())
+    digest.update(repr(parts).encode())
+    return f"native-{digest.hexdigest()}"
+
+
+def _cache(function: Callable[..., Any]) -> Any:
+    """numba's cache of one function in our folder, whether or not it can be written."""
+    from numba.core import caching
+
+    place = folder()
+
+    class Locator(caching.UserProvidedCacheLocator):
+        def get_cache_path(self) -> str:
+            return str(place)
+
+        def ensure_cache_path(self) -> None:
+            with contextlib.suppress(OSError):
+                place.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+        @classmethod
+        def from_function(cls, py_func: Any, py_file: str) -> Any:
+            made = cls(py_func, py_file)
+            made.ensure_cache_path()
+            return made
+
+    class Stored(caching.CompileResultCacheImpl):
+        _locator_classes: ClassVar[Any] = [Locator]  # type: ignore[misc]
+
+    class Cache(caching.FunctionCache):
+        _impl_class = Stored
+
+        def load_overload(self, sig: Any, target_context: Any) -> Any:
+            with contextlib.suppress(Exception):  # damaged: compiled again
+                return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+            return None
+
+        def save_overload(self, sig: Any, data: Any) -> None:
+            with contextlib.suppress(OSError):  # not ours to write
+                super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+    return Cache(function)  # type: ignore[no-untyped-call]

@@ -1,0 +1,95 @@
+"""A probabilistic roadmap over free cells, joined along the skeleton where samples alone do not."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive._skeleton import Graph, Space, clear_only, lengths, only, pieces, tidy
+
+NEAR = 16
+"""To how many nodes of the skeleton a sample may be joined."""
+
+
+def roadmap(where: Space, skeleton: Graph, *, samples: int, neighbours: int, max_edge: float, seed: int) -> Graph:
+    """Seeded samples joined to their nearest neighbours by collision-free straight lines. Lengths are in cells.
+
+    Half of the samples are drawn evenly from the space, half from the skeleton's nodes and edges, where clearance is
+    largest and narrow passages are met (as medial-axis roadmaps do). Pieces that samples leave apart are joined over
+    nodes of the skeleton, so that what the skeleton connects is connected; samples in places that the skeleton leaves
+    out, and those that see neither it nor another sample, are left out.
+    """
+    from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+
+    random = np.random.default_rng(seed)
+    middle = _along(skeleton, where, samples // 2, random)
+    cells = np.unique(np.concatenate([middle, _anywhere(where, samples - len(middle), random)]), axis=0)
+    n = len(cells)
+    _, near = cKDTree(cells).query(cells, k=min(neighbours + 1, n), distance_upper_bound=max_edge)
+    near = near.reshape(n, -1)
+    a, b = np.repeat(np.arange(n), near.shape[1]), near.ravel()
+    pairs = np.stack([a, b], axis=1)[(b < n) & (a != b)]
+    edges = clear_only(np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64), cells, where)
+    return _joined(Graph(cells, edges), skeleton, where)
+
+
+def _along(skeleton: Graph, where: Space, count: int, random: np.random.Generator) -> NDArray[np.int64]:
+    """Cells on the skeleton's edges, evenly by length."""
+    if not len(skeleton.edges):
+        return np.empty((0, 2), np.int64)
+    length = lengths(skeleton.nodes, skeleton.edges)
+    edge = random.choice(len(length), size=count, p=length / length.sum())
+    a, b = skeleton.nodes[skeleton.edges[edge, 0]], skeleton.nodes[skeleton.edges[edge, 1]]
+    cells = np.rint(a + (b - a) * random.random((count, 1))).astype(np.int64)
+    return np.asarray(cells[where.mask[cells[:, 0], cells[:, 1]] == 1])
+
+
+def _anywhere(where: Space, count: int, random: np.random.Generator) -> NDArray[np.int64]:
+    """Different cells of the space, evenly."""
+    before = np.concatenate([[0], np.cumsum(where.mask.sum(axis=1, dtype=np.int64))])
+    chosen = np.sort(random.choice(int(before[-1]), size=min(count, int(before[-1])), replace=False))
+    rows = np.searchsorted(before, chosen, side="right") - 1
+    out = np.empty((len(chosen), 2), np.int64)
+    out[:, 0] = rows
+    for row in np.unique(rows):
+        here = rows == row if len(chosen) < 64 else slice(*np.searchsorted(rows, [row, row + 1]))
+        out[here, 1] = np.flatnonzero(where.mask[row])[chosen[here] - before[row]]
+    return out
+
+
+def _joined(graph: Graph, skeleton: Graph, where: Space) -> Graph:
+    """The roadmap with what of the skeleton is needed to join its pieces, without what nothing can join."""
+    from scipy.sparse import coo_array  # type: ignore[import-untyped]
+    from scipy.sparse.csgraph import minimum_spanning_tree  # type: ignore[import-untyped]
+    from scipy.spatial import cKDTree
+
+    n, more = len(graph.nodes), len(skeleton.nodes)
+    nodes = np.concatenate([graph.nodes, skeleton.nodes])
+    k = min(NEAR, more)
+    _, near = cKDTree(skeleton.nodes).query(graph.nodes, k=k)
+    pairs = np.stack([np.repeat(np.arange(n), k), near.reshape(-1) + n], axis=1).astype(np.int64)
+    ways = np.concatenate([clear_only(pairs, nodes, where), skeleton.edges + n])
+    links = np.concatenate([graph.edges, ways])
+    # A tree that prefers the roadmap's own edges, then short ways; a weight of 0 would mean no edge to scipy.
+    weight = np.concatenate([np.full(len(graph.edges), 1e-6), np.maximum(lengths(nodes, ways), 0.0) + 1e-3])
+    size = n + more
+    tree = minimum_spanning_tree(coo_array((weight, (links[:, 0], links[:, 1])), (size, size)).tocsr()).tocoo()
+    added = np.stack([tree.row, tree.col], axis=1).astype(np.int64)[(tree.row >= n) | (tree.col >= n)]
+    # Ends of the tree that are nodes of the skeleton lead nowhere.
+    while True:
+        degree = np.bincount(added.ravel(), minlength=size)
+        degree[:n] = 2
+        stays = (degree[added] > 1).all(axis=1)
+        if stays.all():
+            break
+        added = added[stays]
+    full = Graph(nodes, np.concatenate([graph.edges, added]))
+    kept = np.ones(size, bool)
+    kept[n:] = False
+    kept[added.ravel()] = True
+    count, piece = pieces(Graph(nodes, links))  # with all of the skeleton: which pieces belong to it
+    known = np.zeros(count, bool)
+    known[piece[n:]] = True
+    kept &= known[piece]
+    full = only(full, kept)
+    return tidy(full.nodes, full.edges)

@@ -1,0 +1,255 @@
+"""Occupancy -> topology: the network of ways that an occupancy grid leaves open to a round robot.
+
+Free space is where the robot's centre may be: cells that are farther than ``robot_radius`` from every obstacle, between
+cell centres, which is how Nav2's inflation layer tells a collision (InflationLayer::computeCost). Unknown cells and
+what is beyond the grid are obstacles. Every edge is a straight line that crosses such cells only, so it is
+collision-free in any format; its ``width`` is the free width at its narrowest cell. What free space connects is
+connected. Ids are made from places on a coarse raster, so that where a map does not change, most ids do not either.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import derives
+from app.errors import Ambiguous, CannotConvert, Invalid, NotFound, Problem, TooLarge
+from app.model.features import Features, Properties, from_columns, points
+from app.model.grid import OccupancyGrid
+from app.model.layers import MAP, NETWORK, Layers, Part, PartKey
+from app.parameters import parameter
+
+if TYPE_CHECKING:
+    from app.derive._skeleton import Graph, Space
+
+RASTERS = (0.5, 0.1, 0.01)
+"""Metres: a node is named after its place on the first of these on which no other node has the same."""
+
+BELONGS: Mapping[str, str] = {
+    "spacing": "skeleton",
+    "detour": "skeleton",
+    "samples": "roadmap",
+    "neighbours": "roadmap",
+    "max_edge": "roadmap",
+    "seed": "roadmap",
+}
+"""Parameters that only one method has."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """How free space becomes a network."""
+
+    method: Literal["skeleton", "roadmap"] = parameter(
+        "skeleton",
+        "how ways are found: the middle lines of free space, with straight ways through the open (skeleton), or random "
+        "samples joined where nothing is between (roadmap)",
+    )
+    grid: str | None = parameter(None, "which grid; default: map, else the only one of a level")
+    robot_radius: float = parameter(
+        0.3, "radius of the robot: no edge is nearer to an obstacle", minimum=0.0, maximum=100.0, unit="m"
+    )
+    unknown: bool = parameter(False, "whether unknown cells may be driven through")
+    tolerance: float = parameter(
+        0.1, "how far straight edges may be from the skeleton", minimum=0.0, maximum=100.0, unit="m"
+    )
+    spur: float = parameter(
+        0.5,
+        "dead ends of the skeleton that reach less than this beyond the free circle around their junction are cut",
+        minimum=0.0,
+        maximum=1000.0,
+        unit="m",
+    )
+    island: float = parameter(
+        2.0,
+        "free places less than this across that nothing connects to the rest are left out; the largest always stays",
+        minimum=0.0,
+        maximum=1e6,
+        unit="m",
+    )
+    spacing: float = parameter(
+        1.5,
+        "skeleton: longest distance of nodes along it, and between nodes in the open; 0: only its own corners",
+        minimum=0.0,
+        maximum=1000.0,
+        unit="m",
+    )
+    detour: float = parameter(
+        1.2,
+        "skeleton with spacing: a straight way is added where the way around is more than this many times as long",
+        minimum=1.0,
+        maximum=100.0,
+    )
+    samples: int = parameter(1000, "roadmap: how many places are drawn", minimum=2, maximum=200_000)
+    neighbours: int = parameter(10, "roadmap: to how many of its nearest samples one is joined", minimum=1, maximum=64)
+    max_edge: float = parameter(5.0, "roadmap: longest edge between samples", minimum=0.01, maximum=1000.0, unit="m")
+    seed: int = parameter(0, "roadmap: another number draws other samples", minimum=0, maximum=2**31 - 1)
+
+
+@derives(gives="topology", needs={"occupancy"}, parameters=Parameters, cost=3.0)
+def occupancy_to_topology(layers: Layers, parameters: Parameters) -> Layers:
+    """The ways through an occupancy grid's free space as a network of nodes and directed edges.
+
+    One network for each level. Raises CannotConvert where a grid has no ways (nothing free, no obstacle, too narrow for
+    the robot), NotFound or Ambiguous where the grid is not clear, Invalid for parameters of another method.
+    """
+    _check(parameters)
+    parts: dict[PartKey, Part] = {}
+    for key, grid in _chosen(layers, parameters.grid).items():
+        parts[PartKey("topology", key.level, NETWORK)] = network(grid, parameters, _called(key))
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def network(grid: OccupancyGrid, parameters: Parameters, called: str) -> Features:
+    """One grid's network. called: what errors call the grid."""
+    from app.derive import _roadmap, _skeleton
+
+    where = _space(grid, parameters, called)
+    cell = grid.resolution
+    graph = _skeleton.skeleton(
+        where,
+        merge=max(parameters.robot_radius / cell, 2.0),
+        spur=parameters.spur / cell,
+        tolerance=parameters.tolerance / cell,
+        island=parameters.island / cell,
+    )
+    if parameters.method == "roadmap":
+        graph = _roadmap.roadmap(
+            where,
+            graph,
+            samples=parameters.samples,
+            neighbours=parameters.neighbours,
+            max_edge=parameters.max_edge / cell,
+            seed=parameters.seed,
+        )
+    elif parameters.spacing > 0.0:
+        spacing = max(parameters.spacing / cell, 2.0)
+        graph = _skeleton.filled(
+            graph, where, spacing=spacing, detour=parameters.detour, phase=_phase(grid, where, spacing)
+        )
+    if not len(graph.edges):
+        raise CannotConvert(
+            f"{called} leaves {where.cells} cells to a robot of radius {parameters.robot_radius:g} m, too few for a "
+            f"way between two places: give a smaller robot_radius, more samples, or a grid of more than one spot"
+        )
+    return _features(grid, where, graph)
+
+
+def _check(parameters: Parameters) -> None:
+    """Refuse what the chosen method would ignore."""
+    changed = [f.name for f in fields(parameters) if getattr(parameters, f.name) != f.default]
+    wrong = [n for n in changed if BELONGS.get(n, parameters.method) != parameters.method]
+    if wrong:
+        problems = [Problem(f"belongs to method={BELONGS[n]}, not to {parameters.method}", where=n) for n in wrong]
+        raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
+
+
+def _chosen(layers: Layers, name: str | None) -> dict[PartKey, OccupancyGrid]:
+    """One grid for each level: the named one, else ``map``, else the only one."""
+    grids = layers.grids()
+    if name is not None:
+        found = {k: g for k, g in grids.items() if k.name == name}
+        if not found:
+            there = ", ".join(sorted({k.name for k in grids})) or "none"
+            raise NotFound(f"there is no occupancy grid {name!r}; there are: {there}")
+        return found
+    out = {}
+    for level in dict.fromkeys(k.level for k in grids):
+        here = {k: g for k, g in grids.items() if k.level == level}
+        plain = {k: g for k, g in here.items() if k.name == MAP} or here
+        if len(plain) > 1:
+            there = ", ".join(k.name for k in plain)
+            raise Ambiguous(f"level {level!r} has several occupancy grids ({there}): name one with grid=")
+        out.update(plain)
+    return out
+
+
+def _called(key: PartKey) -> str:
+    return f"the occupancy grid {key.name!r} of level {key.level!r}"
+
+
+def _space(grid: OccupancyGrid, parameters: Parameters, called: str) -> Space:
+    """Where the robot may be; says what is wrong with a grid that has no such place, or nothing to go around."""
+    from app.derive import _skeleton
+
+    if grid.cells.size >= 2**31 - 2 * (grid.width + grid.height):
+        raise TooLarge(f"{called} has {grid.cells.size} cells; a network can be made of at most 2^31")
+    found = _skeleton.free_cells(grid, parameters.unknown)
+    if found is None:
+        counts = grid.counts()
+        told = ", ".join(f"{counts[n]} {n}" for n in ("occupied", "unknown", "other") if counts[n])
+        hint = "; unknown=true drives through unknown cells" if counts["unknown"] and not parameters.unknown else ""
+        raise CannotConvert(
+            f"{called} has no free cell ({told}), so there are no ways: upload a map with free space{hint}"
+        )
+    free, row, column = found
+    if free.shape == (grid.height + 2, grid.width + 2) and free[1:-1, 1:-1].all():
+        raise CannotConvert(
+            f"{called} is free all over: without an obstacle nothing tells where ways are. Upload a map that has some, "
+            f"or the network itself"
+        )
+    where = _skeleton.space(free, row, column, parameters.robot_radius / grid.resolution)
+    if not where.cells:
+        widest = _skeleton.widest(where) * grid.resolution
+        raise CannotConvert(
+            f"{called} has no place for a robot of radius {parameters.robot_radius:g} m: the farthest that a free cell "
+            f"is from obstacles is {widest:.3g} m. Give a robot_radius below that"
+        )
+    return where
+
+
+def _phase(grid: OccupancyGrid, where: Space, spacing: float) -> tuple[float, float]:
+    """Where a lattice that is fixed to the local frame begins in a space: row and column."""
+    x, y, yaw = grid.origin
+    c, s = math.cos(yaw), math.sin(yaw)
+    along, across = (c * x + s * y) / grid.resolution, (c * y - s * x) / grid.resolution
+    return (-(across + where.row) % spacing, -(along + where.column) % spacing)
+
+
+def _features(grid: OccupancyGrid, where: Space, graph: Graph) -> Features:
+    """Nodes, then edges, both ways each."""
+    from app.derive import _kernels_space
+
+    x, y, yaw = grid.origin
+    c, s = math.cos(yaw), math.sin(yaw)
+    u = (graph.nodes[:, 1] + where.column + 0.5) * grid.resolution
+    v = (graph.nodes[:, 0] + where.row + 0.5) * grid.resolution
+    xy = np.round(np.stack([x + c * u - s * v, y + s * u + c * v], axis=1), 9) + 0.0
+    names = _names(xy)
+    width = np.empty(len(graph.edges))
+    _kernels_space.widths(where.gap, graph.nodes, graph.edges, width)
+    metres = np.round(np.concatenate([width, width]) * grid.resolution, 6).tolist()
+    ends = np.concatenate([graph.edges, graph.edges[:, ::-1]])
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    ends, metres = ends[order], [metres[k] for k in order]
+    pairs = [(names[a], names[b]) for a, b in ends.tolist()]
+    properties: list[Properties] = [{"kind": "node", "name": n} for n in names]
+    properties += [
+        {"kind": "edge", "source": a, "target": b, "width": w} for (a, b), w in zip(pairs, metres, strict=True)
+    ]
+    lines = np.asarray(shapely.linestrings(xy[ends]), object)
+    geometry = np.concatenate([points(xy), lines])
+    return from_columns([*names, *(f"{a}_{b}" for a, b in pairs)], geometry, properties, "local")
+
+
+def _names(xy: NDArray[np.float64]) -> list[str]:
+    """A name for each place: ``p`` and its coordinates on the coarsest raster that tells it from all others."""
+    names = [""] * len(xy)
+    left = np.arange(len(xy))
+    for step in RASTERS:
+        digits = 2 if step < 0.1 else 1
+        cell = np.round(xy[left] / step).astype(np.int64)
+        _, place, counts = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+        alone = counts[place.reshape(-1)] == 1
+        for k, (i, j) in zip(left[alone].tolist(), (cell[alone] * step + 0.0).tolist(), strict=True):
+            names[k] = f"p{i:.{digits}f}_{j:.{digits}f}"
+        left = left[~alone]
+    for k, (i, j) in zip(left.tolist(), xy[left].tolist(), strict=True):
+        names[k] = f"p{i!r}_{j!r}"
+    return names
