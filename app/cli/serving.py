@@ -58,6 +58,7 @@ def serve(*, demo: bool = False, **values: Any) -> None:
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
         check(settings)
         os.environ.update(settings.as_environment())  # what worker processes read
+        _compile(settings.data_dir / "native")
         output.show(f"Fleet Map Server: {address} · documentation: {address}/docs")
         sys.stdout.flush()
         if demo:
@@ -66,6 +67,20 @@ def serve(*, demo: bool = False, **values: Any) -> None:
         _run(settings, listener)
     finally:
         listener.close()
+
+
+def _compile(folder: Path) -> None:
+    """Have the derivations' native code compiled into a folder, beside the start: workers read it and cannot write.
+
+    Where ``NUMBA_CACHE_DIR`` names a folder, that one is taken. Until it is done, workers compile what they need.
+    """
+    from app.derive import _native
+
+    where = os.environ.setdefault(_native.FOLDER, str(folder.resolve()))
+    process = multiprocessing.get_context("spawn").Process(
+        target=_native.fill_quietly, args=(Path(where),), daemon=True
+    )
+    process.start()
 
 
 def migrate(

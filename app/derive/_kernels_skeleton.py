@@ -51,14 +51,6 @@ _BLOCK = 4 | 8 | 16
 
 
 @native
-def _code(mask: U8, y: int, x: int) -> int:
-    code = 0
-    for k in range(8):
-        code |= (mask[y + _DY[k], x + _DX[k]] & 1) << k
-    return code
-
-
-@native
 def _lone_block(mask: U8, y: int, x: int) -> bool:
     """Whether the 2 × 2 cells from (y, x) on have no neighbours (those of (y, x) itself are known)."""
     height, width = mask.shape
@@ -141,15 +133,30 @@ def thin(mask: U8) -> int:
         if n1 > len(gone):
             gone = np.empty(len(first), np.int32)
         bit = 3 - bit
-    # What is left of steps: cells that can go without cutting anything.
-    for y in range(1, height - 1):
-        for x in range(1, width - 1):
-            if mask[y, x]:
-                if _REDUNDANT[_code(mask, y, x)]:
-                    mask[y, x] = 0
-                    count -= 1
-                else:
-                    mask[y, x] = 1
+    # What is left of steps: cells that can go without cutting anything, until there is none.
+    left = np.empty(count, np.int32)
+    n = 0
+    for cell in range(len(flat)):
+        if flat[cell]:
+            flat[cell] = 1
+            left[n] = cell
+            n += 1
+    again = True
+    while again:
+        again = False
+        n = 0
+        for i in range(count):
+            cell = left[i]
+            code = 0
+            for k in range(8):
+                code |= flat[cell + step[k]] << k
+            if _REDUNDANT[code]:
+                flat[cell] = 0
+                again = True
+            else:
+                left[n] = cell
+                n += 1
+        count = n
     return count
 
 
@@ -497,7 +504,7 @@ def simplify(mask: U8, cells: I32, begin: I64, path: I64, tolerance: float, keep
     """Mark in ``keep`` (one for each place in ``path``) the corners of straight lines that replace each line.
 
     As Douglas and Peucker do it, but a straight line must also stay in the mask; it deviates by ``tolerance`` cells at
-    most. Steps between neighbouring cells of the mask always may stay, so this always ends.
+    most. Steps to a neighbouring cell always may stay, so this always ends.
     """
     stack = np.empty((len(path) + 2, 2), np.int64)
     for c in range(len(begin) - 1):

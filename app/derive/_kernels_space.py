@@ -85,7 +85,7 @@ def distance2(gap: U16, y: int, x: int) -> int:
 
 @native
 def clear(mask: U8, y0: int, x0: int, y1: int, x1: int) -> bool:
-    """Whether the straight line between two cell centres stays in cells of the mask (touching corners is allowed)."""
+    """Whether all cells that the straight line between two cell centres touches are in the mask."""
     dx, dy = abs(x1 - x0), abs(y1 - y0)
     sx, sy = (1 if x1 > x0 else -1), (1 if y1 > y0 else -1)
     x, y, i, j = x0, y0, 0, 0
@@ -95,6 +95,8 @@ def clear(mask: U8, y0: int, x0: int, y1: int, x1: int) -> bool:
         if i == dx and j == dy:
             return True
         side = (1 + 2 * i) * dy - (1 + 2 * j) * dx
+        if side == 0 and (mask[y, x + sx] == 0 or mask[y + sy, x] == 0):
+            return False
         if side <= 0:
             x += sx
             i += 1
@@ -105,20 +107,21 @@ def clear(mask: U8, y0: int, x0: int, y1: int, x1: int) -> bool:
 
 @native
 def narrowest(gap: U16, y0: int, x0: int, y1: int, x1: int) -> int:
-    """The smallest squared distance to an obstacle over the cells of a straight line."""
+    """The smallest squared distance to an obstacle over the cells that a straight line touches."""
     dx, dy = abs(x1 - x0), abs(y1 - y0)
     sx, sy = (1 if x1 > x0 else -1), (1 if y1 > y0 else -1)
     x, y, i, j = x0, y0, 0, 0
     best = distance2(gap, y, x)
     while not (i == dx and j == dy):
         side = (1 + 2 * i) * dy - (1 + 2 * j) * dx
+        if side == 0:
+            best = min(best, distance2(gap, y, x + sx), distance2(gap, y + sy, x))
         if side <= 0:
             x += sx
             i += 1
         if side >= 0:
             y += sy
             j += 1
-        # A neighbour is nearer by one and a half cells at most: most cells need no exact look.
         best = min(best, distance2(gap, y, x))
     return best
 
@@ -132,7 +135,7 @@ def widths(gap: U16, cells: I64, pairs: I64, out: F64) -> None:
     for k in range(len(pairs)):
         a, b = pairs[k, 0], pairs[k, 1]
         nearest = narrowest(gap, cells[a, 0], cells[a, 1], cells[b, 0], cells[b, 1])
-        out[k] = 2.0 * np.sqrt(nearest) - 1.0
+        out[k] = max(0.0, 2.0 * np.sqrt(nearest) - 1.0)
 
 
 @native

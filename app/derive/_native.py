@@ -30,6 +30,9 @@ _KERNELS = "_kernels_"
 """Modules of this name hold kernels and nothing else; they are imported when first needed."""
 
 
+_PREFIX = "fleetmap-native-"
+
+
 def folder() -> Path:
     """Where compiled code of this release, machine and user is kept; it need not exist."""
     said = os.environ.get(FOLDER)
@@ -56,7 +59,7 @@ def fill(where: Path) -> None:
     if target.is_dir():
         return
     where.mkdir(parents=True, exist_ok=True)
-    for old in where.iterdir():  # of other releases
+    for old in where.glob(f"{_PREFIX}*"):  # of other releases
         shutil.rmtree(old, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=where) as scratch:
         os.environ[FOLDER] = scratch
@@ -88,7 +91,7 @@ def _key() -> str:
         digest.update(file.read_bytes())
     parts = (metadata.version("numba"), metadata.version("numpy"), platform.python_version(), platform.machine())
     digest.update(repr(parts).encode())
-    return f"native-{digest.hexdigest()}"
+    return f"{_PREFIX}{digest.hexdigest()}"
 
 
 def _cache(function: Callable[..., Any]) -> Any:
@@ -123,7 +126,7 @@ def _cache(function: Callable[..., Any]) -> Any:
             return None
 
         def save_overload(self, sig: Any, data: Any) -> None:
-            with contextlib.suppress(OSError):  # not ours to write
+            with contextlib.suppress(Exception):  # not ours to write, or damaged
                 super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
     return Cache(function)  # type: ignore[no-untyped-call]

@@ -11,13 +11,15 @@ NEAR = 16
 """To how many nodes of the skeleton a sample may be joined."""
 
 
-def roadmap(where: Space, skeleton: Graph, *, samples: int, neighbours: int, max_edge: float, seed: int) -> Graph:
+def roadmap(
+    where: Space, skeleton: Graph, *, samples: int, neighbours: int, max_edge: float, seed: int
+) -> tuple[Graph, int]:
     """Seeded samples joined to their nearest neighbours by collision-free straight lines. Lengths are in cells.
 
     Half of the samples are drawn evenly from the space, half from the skeleton's nodes and edges, where clearance is
     largest and narrow passages are met (as medial-axis roadmaps do). Pieces that samples leave apart are joined over
     nodes of the skeleton, so that what the skeleton connects is connected; samples in places that the skeleton leaves
-    out, and those that see neither it nor another sample, are left out.
+    out, and those that see neither it nor another sample, are left out; how many is told.
     """
     from scipy.spatial import cKDTree  # type: ignore[import-untyped]
 
@@ -57,7 +59,7 @@ def _anywhere(where: Space, count: int, random: np.random.Generator) -> NDArray[
     return out
 
 
-def _joined(graph: Graph, skeleton: Graph, where: Space) -> Graph:
+def _joined(graph: Graph, skeleton: Graph, where: Space) -> tuple[Graph, int]:
     """The roadmap with what of the skeleton is needed to join its pieces, without what nothing can join."""
     from scipy.sparse import coo_array  # type: ignore[import-untyped]
     from scipy.sparse.csgraph import minimum_spanning_tree  # type: ignore[import-untyped]
@@ -92,4 +94,4 @@ def _joined(graph: Graph, skeleton: Graph, where: Space) -> Graph:
     known[piece[n:]] = True
     kept &= known[piece]
     full = only(full, kept)
-    return tidy(full.nodes, full.edges)
+    return tidy(full.nodes, full.edges), n - int(kept[:n].sum())

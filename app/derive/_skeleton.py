@@ -75,12 +75,12 @@ def widest(where: Space) -> float:
     return low
 
 
-def skeleton(where: Space, *, merge: float, spur: float, tolerance: float, island: float) -> Graph:
+def skeleton(where: Space, *, merge: float, spur: float, tolerance: float, island: float) -> tuple[Graph, int]:
     """The skeleton of a space as a graph of straight, collision-free edges. Lengths are in cells.
 
     merge: junctions nearer than this along the skeleton are one. spur: dead ends that reach less than this beyond the
     free circle of their junction are cut. tolerance: how far a straight edge may be from the skeleton. island: pieces
-    smaller than this across are left out (the largest always stays).
+    smaller than this across are left out (the largest always stays); how many is told.
     """
     from app.derive import _kernels_skeleton as kernels
 
@@ -105,13 +105,16 @@ def skeleton(where: Space, *, merge: float, spur: float, tolerance: float, islan
     return without_islands(graph, where, island)
 
 
-def without_islands(graph: Graph, where: Space, island: float) -> Graph:
-    """The graph without pieces that are less than ``island`` cells across, but always with the largest one."""
+def without_islands(graph: Graph, where: Space, island: float) -> tuple[Graph, int]:
+    """The graph without pieces that are less than ``island`` cells across, but always with the largest one.
+
+    And how many such pieces there were.
+    """
     from app.derive import _kernels_space as kernels
 
     count, piece = pieces(graph)
     if count < 2:
-        return graph
+        return graph, 0
     low, high = np.full((count, 2), 2**31), np.full((count, 2), -1)
     np.minimum.at(low, piece, graph.nodes)
     np.maximum.at(high, piece, graph.nodes)
@@ -122,7 +125,7 @@ def without_islands(graph: Graph, where: Space, island: float) -> Graph:
     across = np.hypot(*(high - low).T) + 2.0 * widest
     stays = across >= island
     stays[int(np.argmax(across))] = True
-    return only(graph, stays[piece])
+    return only(graph, stays[piece]), int(count - stays.sum())
 
 
 def pieces(graph: Graph) -> tuple[int, NDArray[np.int64]]:

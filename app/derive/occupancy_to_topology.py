@@ -18,7 +18,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive import derives
+from app.derive import Notes, derives
 from app.errors import Ambiguous, CannotConvert, Invalid, NotFound, Problem, TooLarge
 from app.model.features import Features, Properties, from_columns, points
 from app.model.grid import OccupancyGrid
@@ -93,7 +93,7 @@ class Parameters:
 
 
 @derives(gives="topology", needs={"occupancy"}, parameters=Parameters, cost=3.0)
-def occupancy_to_topology(layers: Layers, parameters: Parameters) -> Layers:
+def occupancy_to_topology(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """The ways through an occupancy grid's free space as a network of nodes and directed edges.
 
     One network for each level. Raises CannotConvert where a grid has no ways (nothing free, no obstacle, too narrow for
@@ -102,25 +102,29 @@ def occupancy_to_topology(layers: Layers, parameters: Parameters) -> Layers:
     _check(parameters)
     parts: dict[PartKey, Part] = {}
     for key, grid in _chosen(layers, parameters.grid).items():
-        parts[PartKey("topology", key.level, NETWORK)] = network(grid, parameters, _called(key))
+        parts[PartKey("topology", key.level, NETWORK)] = network(grid, parameters, notes, _called(key))
     return Layers(parts, layers.datum, layers.levels)
 
 
-def network(grid: OccupancyGrid, parameters: Parameters, called: str) -> Features:
+def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: str) -> Features:
     """One grid's network. called: what errors call the grid."""
     from app.derive import _roadmap, _skeleton
 
     where = _space(grid, parameters, called)
     cell = grid.resolution
-    graph = _skeleton.skeleton(
+    graph, islands = _skeleton.skeleton(
         where,
         merge=max(parameters.robot_radius / cell, 2.0),
         spur=parameters.spur / cell,
         tolerance=parameters.tolerance / cell,
         island=parameters.island / cell,
     )
+    notes.drop("places", islands, f"{called}: under island={parameters.island:g} m across, no way to the rest")
+    count, _ = _skeleton.pieces(graph)
+    if count > 1:
+        notes.warn(f"the network is in {count} pieces: no way that the robot fits joins them", where=called)
     if parameters.method == "roadmap":
-        graph = _roadmap.roadmap(
+        graph, alone = _roadmap.roadmap(
             where,
             graph,
             samples=parameters.samples,
@@ -128,6 +132,7 @@ def network(grid: OccupancyGrid, parameters: Parameters, called: str) -> Feature
             max_edge=parameters.max_edge / cell,
             seed=parameters.seed,
         )
+        notes.drop("samples", alone, f"{called}: they see nothing to be joined to, or lie in places left out")
     elif parameters.spacing > 0.0:
         spacing = max(parameters.spacing / cell, 2.0)
         graph = _skeleton.filled(

@@ -1,0 +1,445 @@
+"""Grids become networks: collision-free, connected as free space is, in the right place, and never silently empty."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+from typing import Any
+
+import networkx as nx
+import numpy as np
+import pytest
+import shapely
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from app import derive, parameters
+from app.bundle import Hints, Known, read
+from app.derive import Notes
+from app.derive.occupancy_to_topology import Parameters, occupancy_to_topology
+from app.errors import Ambiguous, CannotConvert, Invalid, NotFound
+from app.formats import Limits
+from app.model.features import Features
+from app.model.frame import Level
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import NETWORK, Layers, PartKey
+
+METHODS = ("skeleton", "roadmap")
+FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def grid(cells: Any, resolution: float = 0.1, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> OccupancyGrid:
+    return OccupancyGrid(np.ascontiguousarray(cells, np.uint8), resolution, origin)
+
+
+def rooms(seed: int = 0, size: int = 120) -> NDArray[np.uint8]:
+    """Rooms of different sizes with doors, posts in them, and a sealed one."""
+    random = np.random.default_rng(seed)
+    cells = np.full((size, size), OCCUPIED, np.uint8)
+    third = size // 3
+    for row, column in itertools.product(range(3), range(3)):
+        cells[row * third + 2 : (row + 1) * third - 2, column * third + 2 : (column + 1) * third - 2] = FREE
+        if (row, column) == (2, 2):
+            continue
+        door = int(random.integers(8, third - 16))
+        if column < 2 and (row, column + 1) != (2, 2):
+            cells[row * third + door : row * third + door + 9, column * third : (column + 1) * third + 4] = FREE
+        if row < 2 and (row + 1, column) != (2, 2):
+            cells[row * third : (row + 1) * third + 4, column * third + door : column * third + door + 9] = FREE
+    cells[:1], cells[-1:], cells[:, :1], cells[:, -1:] = OCCUPIED, OCCUPIED, OCCUPIED, OCCUPIED
+    for y, x in random.integers(5, size - 5, (12, 2)):
+        cells[y : y + 2, x : x + 2] = OCCUPIED
+    return cells
+
+
+def derived(g: OccupancyGrid, **values: Any) -> Features:
+    made = occupancy_to_topology(Layers({PartKey("occupancy"): g}), Parameters(**values), Notes())
+    assert set(made.parts) == {PartKey("topology", "ground", NETWORK)}
+    part = made.parts[PartKey("topology", "ground", NETWORK)]
+    assert isinstance(part, Features)
+    return part
+
+
+def graph_of(f: Features) -> nx.DiGraph:
+    g = nx.DiGraph()
+    for item in f:
+        if item.properties["kind"] == "node":
+            g.add_node(item.id, at=(item.geometry.x, item.geometry.y))
+    for item in f:
+        if item.properties["kind"] == "edge":
+            a, b = item.properties["source"], item.properties["target"]
+            (x0, y0), (x1, y1) = item.geometry.coords
+            assert g.nodes[a]["at"] == (x0, y0)
+            assert g.nodes[b]["at"] == (x1, y1)
+            g.add_edge(a, b, length=item.geometry.length, width=item.properties["width"])
+    return g
+
+
+def cells_at(g: OccupancyGrid, xy: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Row and column of places, by the definition of a grid's origin."""
+    x, y, yaw = g.origin
+    dx, dy = xy[:, 0] - x, xy[:, 1] - y
+    u, v = math.cos(yaw) * dx + math.sin(yaw) * dy, math.cos(yaw) * dy - math.sin(yaw) * dx
+    return np.stack([np.floor(v / g.resolution), np.floor(u / g.resolution)], axis=1).astype(np.intp)
+
+
+def distances(g: OccupancyGrid) -> NDArray[np.float64]:
+    """Metres from cell centre to the nearest obstacle's centre, what is beyond the grid being one; by scipy."""
+    free = np.pad(g.cells == FREE, 1)
+    return np.asarray(ndimage.distance_transform_edt(free))[1:-1, 1:-1] * g.resolution
+
+
+def along(line: Any, step: float) -> NDArray[np.float64]:
+    n = max(2, 2 * round(line.length / step / 2))  # even: a step to a diagonal neighbour is not met at the corner
+    return np.asarray(shapely.get_coordinates(shapely.line_interpolate_point(line, np.linspace(0, line.length, n))))
+
+
+def check(g: OccupancyGrid, f: Features, radius: float) -> nx.DiGraph:
+    """Collision-free everywhere, both ways, and connected where free space is."""
+    clearance = distances(g)
+    network = graph_of(f)
+    for item in f:
+        if item.properties["kind"] != "edge":
+            continue
+        at = cells_at(g, along(item.geometry, g.resolution / 5))
+        near = clearance[at[:, 0], at[:, 1]]
+        assert near.min() > radius, f"{item.id} comes within {near.min()} m"
+        # The narrowest of all cells that are touched is at most the narrowest of those that were sampled.
+        assert item.properties["width"] <= 2 * near.min() - g.resolution + 1e-6
+        assert item.properties["width"] >= max(0.0, 2 * (near.min() - 1.5 * g.resolution) - g.resolution)
+        assert network.has_edge(item.properties["target"], item.properties["source"])
+    place, _ = ndimage.label(clearance > radius * (1 + 1e-9), np.ones((3, 3)))
+    pieces = list(nx.weakly_connected_components(network))
+    labels = []
+    for piece in pieces:
+        at = cells_at(g, np.array([network.nodes[n]["at"] for n in piece]))
+        inside = set(place[at[:, 0], at[:, 1]].tolist())
+        assert len(inside) == 1, "edges join what free space does not"
+        labels += inside
+    assert len(set(labels)) == len(labels), "free space joins what the network does not"
+    sizes = np.bincount(place.ravel())[1:]
+    assert int(np.argmax(sizes)) + 1 in labels
+    return network
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("radius", [0.0, 0.15, 0.3])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_every_edge_is_free_and_what_is_connected_stays_connected(method: str, radius: float, seed: int) -> None:
+    g = grid(rooms(seed))
+    network = check(g, derived(g, method=method, robot_radius=radius, island=0.0), radius)
+    assert nx.number_weakly_connected_components(network) >= 2 or method == "roadmap", "the sealed room has ways too"
+    ways = nx.Graph(network)
+    assert ways.number_of_edges() >= ways.number_of_nodes() - 2
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_any_origin_and_yaw_moves_the_network_as_a_whole(method: str) -> None:
+    cells = rooms(3)
+    for origin in ((-6.0, 3.5, 0.0), (100.0, -20.0, 0.7), (0.05, 0.05, -2.5)):
+        g = grid(cells, origin=origin)
+        check(g, derived(g, method=method), 0.3)
+    plain, turned = derived(grid(cells), spacing=0.0), derived(grid(cells, origin=(5.0, -3.0, 0.5)), spacing=0.0)
+    a = shapely.get_coordinates(plain.of_kind("node").geometry)
+    c, s = math.cos(0.5), math.sin(0.5)
+    moved = np.stack([5.0 + c * a[:, 0] - s * a[:, 1], -3.0 + s * a[:, 0] + c * a[:, 1]], axis=1)
+    assert np.allclose(moved, shapely.get_coordinates(turned.of_kind("node").geometry), atol=1e-8)
+
+
+def test_a_corridor_by_hand() -> None:
+    """Seven free cells of 0.1 m between walls, 40 long: one line along the middle row, 0.7 m wide."""
+    cells = np.full((9, 42), OCCUPIED)
+    cells[1:8, 1:41] = FREE
+    f = derived(grid(cells), robot_radius=0.2, spacing=0.0)
+    edges = f.of_kind("edge")
+    rows = shapely.get_coordinates(edges.geometry)[:, 1]
+    long = [e for e in edges if e.geometry.length > 2.0]
+    assert len(long) == 2
+    assert {e.properties["width"] for e in long} == {0.7}
+    assert rows.min() >= 0.4
+    assert rows.max() <= 0.5
+    with pytest.raises(CannotConvert, match=r"farthest that a free cell is from obstacles is 0\.4 m"):
+        derived(grid(cells), robot_radius=0.4)
+    assert len(derived(grid(cells), robot_radius=0.399, spacing=0.0)) == 2 + 2
+
+
+def test_a_ring_around_a_post_stays_a_ring() -> None:
+    cells = np.full((61, 61), FREE)
+    cells[[0, -1]], cells[:, [0, -1]] = OCCUPIED, OCCUPIED
+    cells[25:36, 25:36] = OCCUPIED
+    network = nx.Graph(check(grid(cells), derived(grid(cells), spacing=0.0), 0.3))
+    cycles = nx.cycle_basis(network)
+    assert len(cycles) == 1
+    ring = shapely.Polygon([network.nodes[n]["at"] for n in cycles[0]])
+    assert ring.contains(shapely.box(2.5, 2.5, 3.6, 3.6))
+
+
+def test_unknown_is_an_obstacle_unless_said() -> None:
+    cells = rooms(1)
+    cells[cells == OCCUPIED] = UNKNOWN
+    g = grid(cells)
+    check(g, derived(g), 0.3)
+    cells = np.full((40, 40), UNKNOWN)
+    cells[5:35, 5:12], cells[5:35, 28:35], cells[0, 0] = FREE, FREE, OCCUPIED
+    apart = graph_of(derived(grid(cells), island=0.0))
+    assert nx.number_weakly_connected_components(apart) == 2
+    whole = graph_of(derived(grid(cells), island=0.0, unknown=True))
+    assert nx.number_weakly_connected_components(whole) == 1
+
+
+def test_islands_go_but_never_all() -> None:
+    cells = rooms(2)
+    assert nx.number_weakly_connected_components(graph_of(derived(grid(cells), island=0.0))) > 1
+    assert nx.number_weakly_connected_components(graph_of(derived(grid(cells), island=6.0))) == 1
+    assert len(derived(grid(cells), island=1e6)) > 10
+
+
+def test_what_is_left_out_is_said() -> None:
+    notes = Notes()
+    layers = Layers({PartKey("occupancy"): grid(rooms(2))})
+    occupancy_to_topology(layers, Parameters(island=6.0), notes)
+    assert [(d["what"], d["count"]) for d in notes.dropped] == [("places", 1)]
+    assert not notes.warnings
+    notes = Notes()
+    occupancy_to_topology(layers, Parameters(island=0.0), notes)
+    assert [w.problem[:26] for w in notes.warnings] == ["the network is in 2 pieces"]
+    assert not notes.dropped
+    occupancy_to_topology(layers, Parameters(island=6.0, method="roadmap"), notes)
+    assert {d["what"] for d in notes.dropped} == {"places", "samples"}
+
+
+def test_the_open_is_covered_without_detours() -> None:
+    cells = np.full((200, 200), FREE)
+    cells[[0, -1]], cells[:, [0, -1]] = OCCUPIED, OCCUPIED
+    cells[90:110, 60:140] = OCCUPIED
+    g = grid(cells)
+    network = check(g, derived(g, spacing=1.0), 0.3)
+    at = np.array([a for _, a in network.nodes(data="at")])
+    names = list(network)
+    free = np.argwhere(distances(g) > 0.8)
+    away, _ = cKDTree(at).query((free[:, ::-1] + 0.5) * 0.1)
+    assert away.max() <= 1.0
+    ways = dict(nx.all_pairs_dijkstra_path_length(network, weight="length"))
+    random = np.random.default_rng(0)
+    worst = 1.0
+    for a, b in random.integers(0, len(at), (400, 2)):
+        line = shapely.LineString([at[a], at[b]])
+        if line.length > 2.0 and not line.intersects(shapely.box(5.6, 8.6, 14.4, 11.4)):
+            worst = max(worst, ways[names[a]][names[b]] / line.length)
+    assert worst < 1.35
+    sparse = derived(g, spacing=0.0)
+    assert len(sparse) < len(network) / 3
+
+
+def test_a_spur_is_cut_and_a_dead_end_is_not() -> None:
+    cells = np.full((60, 120), OCCUPIED)
+    cells[20:41, 2:118] = FREE
+    cells[15:20, 60] = FREE  # a notch in the wall
+    cells[2:20, 90:101] = FREE  # a bay, two metres deep
+    with_all = nx.Graph(graph_of(derived(grid(cells), robot_radius=0.0, spacing=0.0, spur=0.0)))
+    cut = nx.Graph(graph_of(derived(grid(cells), robot_radius=0.0, spacing=0.0, spur=0.7)))
+
+    def ends(g: nx.Graph, x: float) -> list[float]:
+        return [a[1] for n, a in g.nodes(data="at") if g.degree(n) == 1 and abs(a[0] - x) < 0.8]
+
+    assert min(ends(with_all, 6.05)) < 2.0
+    assert not ends(cut, 6.05)
+    assert min(ends(cut, 9.55)) < 1.2
+
+
+def test_a_line_is_simplified_as_far_as_the_tolerance_and_the_obstacles_let() -> None:
+    steps = np.full((80, 200), OCCUPIED)
+    for x in range(2, 198):
+        y = 30 + round(8 * math.sin(x / 15))
+        steps[y - 6 : y + 7, x] = FREE
+    coarse = derived(grid(steps), robot_radius=0.1, spacing=0.0, tolerance=0.3)
+    fine = derived(grid(steps), robot_radius=0.1, spacing=0.0, tolerance=0.05)
+    free = derived(grid(steps), robot_radius=0.1, spacing=0.0, tolerance=100.0)
+    assert len(free) <= len(coarse) < len(fine)
+    for f in (coarse, fine, free):
+        check(grid(steps), f, 0.1)
+    # The middle lines of both agree within the two tolerances.
+    lines = shapely.union_all(coarse.of_kind("edge").geometry)
+    assert shapely.hausdorff_distance(lines, shapely.union_all(fine.of_kind("edge").geometry), 0.2) < 0.3 + 0.05 + 0.15
+
+
+def test_most_ids_stay_where_the_map_stays() -> None:
+    cells = rooms(4, 240)
+    before = derived(grid(cells))
+    cells = cells.copy()
+    cells[50:53, 50:53] = OCCUPIED
+    after = derived(grid(cells))
+    nodes = set(before.of_kind("node").ids)
+    assert len(nodes & set(after.of_kind("node").ids)) > 0.85 * len(nodes)
+    # The same place in a map that has grown by a strip on its lower left: nothing moves at all.
+    grown = np.full((260, 260), OCCUPIED, np.uint8)
+    grown[20:, 20:] = cells
+    same = derived(grid(grown, origin=(-2.0, -2.0, 0.0)))
+    shared = set(after.of_kind("node").ids) & set(same.of_kind("node").ids)
+    assert len(shared) > 0.9 * len(after.of_kind("node"))
+
+
+def test_roadmaps_are_seeded() -> None:
+    g = grid(rooms(5))
+    a, b, c = (derived(g, method="roadmap", seed=s, samples=300) for s in (1, 1, 2))
+    assert a.ids == b.ids
+    assert list(a.properties) == list(b.properties)
+    assert a.ids != c.ids
+    few, many = (derived(g, method="roadmap", samples=n) for n in (50, 800))
+    assert len(few.of_kind("node")) < 120 < 500 < len(many.of_kind("node"))
+    longest = max(e.geometry.length for e in derived(g, method="roadmap", samples=800, max_edge=0.7).of_kind("edge"))
+    assert longest < 4.0
+
+
+def test_a_narrow_passage_is_found_by_a_roadmap_with_few_samples() -> None:
+    cells = np.full((100, 200), FREE)
+    cells[[0, -1]], cells[:, [0, -1]] = OCCUPIED, OCCUPIED
+    cells[:, 95:105] = OCCUPIED
+    cells[47:56, 95:105] = FREE
+    g = grid(cells)
+    for seed in range(5):
+        network = check(g, derived(g, method="roadmap", samples=20, seed=seed), 0.3)
+        assert nx.number_weakly_connected_components(network) == 1
+
+
+def bad(cells: Any, **values: Any) -> str:
+    with pytest.raises(CannotConvert) as caught:
+        derived(grid(cells), **values)
+    return caught.value.detail
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_grids_without_ways_say_what_to_do(method: str) -> None:
+    assert "free all over" in bad(np.full((50, 60), FREE), method=method)
+    assert "no free cell (3000 occupied)" in bad(np.full((50, 60), OCCUPIED), method=method)
+    unknown = bad(np.full((50, 60), UNKNOWN), method=method)
+    assert "no free cell (3000 unknown)" in unknown
+    assert "unknown=true" in unknown
+    assert "free all over" in bad(np.full((50, 60), UNKNOWN), method=method, unknown=True)
+    assert "free all over" in bad([[FREE]], method=method)
+    assert "no free cell" in bad([[OCCUPIED]], method=method)
+    assert "no free cell (1 other)" in bad([[50]], method=method)
+    large = bad(rooms(), method=method, robot_radius=50.0)
+    assert "radius 50 m" in large
+    assert "Give a robot_radius below" in large
+    spot = np.full((9, 9), OCCUPIED)
+    spot[4, 4] = FREE
+    assert "too few for a way" in bad(spot, method=method, robot_radius=0.0)
+    assert "'map' of level 'ground'" in bad(spot, method=method, robot_radius=0.0)
+
+
+def test_thresholds_in_between_are_not_free() -> None:
+    cells = rooms(1)
+    cells[cells == OCCUPIED] = 40
+    check(grid(cells), derived(grid(cells)), 0.3)
+
+
+def test_which_grid() -> None:
+    g = grid(rooms())
+    parts = {PartKey("occupancy", "ground", n): g for n in ("keepout", "map")}
+    parts[PartKey("occupancy", "L2", "only")] = g
+    layers = Layers(dict(parts), levels=(Level(), Level("L2", 4.0)))
+    assert {k.level for k in occupancy_to_topology(layers, Parameters(), Notes()).parts} == {"ground", "L2"}
+    assert {k.level for k in occupancy_to_topology(layers, Parameters(grid="only"), Notes()).parts} == {"L2"}
+    with pytest.raises(NotFound, match="keepout, map, only"):
+        occupancy_to_topology(layers, Parameters(grid="nogo"), Notes())
+    parts[PartKey("occupancy", "L2", "second")] = g
+    with pytest.raises(Ambiguous, match="only, second"):
+        occupancy_to_topology(Layers(dict(parts), levels=layers.levels), Parameters(), Notes())
+
+
+def test_parameters_are_checked() -> None:
+    with pytest.raises(Invalid, match="samples: belongs to method=roadmap, not to skeleton"):
+        derived(grid(rooms()), samples=5)
+    with pytest.raises(Invalid, match="detour: belongs to method=skeleton"):
+        derived(grid(rooms()), method="roadmap", detour=2.0)
+    with pytest.raises(Invalid, match="at least 0"):
+        parameters.parse(Parameters, {"robot_radius": "-1"})
+    with pytest.raises(Invalid, match="must be one of"):
+        parameters.parse(Parameters, {"method": "magic"})
+    plan = derive.plan(frozenset({"occupancy"}), frozenset({"topology"}))
+    assert plan is not None
+    assert [s.name for s in plan.steps] == ["occupancy_to_topology"]
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("method", METHODS)
+def test_random_grids(method: str, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    shape = random.integers(3, 90, 2)
+    cells = np.where(random.random(shape) < random.choice([0.02, 0.2, 0.4]), OCCUPIED, FREE)
+    cells = np.kron(cells, np.ones((2, 2)))
+    g = grid(cells)
+    for radius in (0.0, 0.1, 0.25):
+        try:
+            f = derived(g, method=method, robot_radius=radius, island=0.0)
+        except CannotConvert:
+            assert (distances(g) > radius * (1 + 1e-9)).sum() < 4000
+            continue
+        check(g, f, radius)
+
+
+@pytest.fixture(scope="module")
+def strawberry() -> tuple[OccupancyGrid, Features]:
+    if not (DATA / FARM).is_dir():
+        pytest.skip("the real maps are not beside the checkout")
+    files = {n: (DATA / FARM / "metric/map" / n).read_bytes() for n in ("map.yaml", "map.png")}
+    files["network.tmap2.yaml"] = (DATA / FARM / "topological/network.tmap2.yaml").read_bytes()
+    told = read(files, Hints(), Known(None, None, None, True, False), Limits()).layers(None)
+    (network,) = told.vector("topology").values()
+    (g,) = told.grids().values()
+    return g, network
+
+
+@pytest.mark.parametrize(("method", "ways"), [("skeleton", 0.9), ("roadmap", 0.7)])
+def test_the_strawberry_map_gives_what_was_drawn_by_hand(
+    strawberry: tuple[OccupancyGrid, Features], method: str, ways: float
+) -> None:
+    """90 % of the nodes within 0.8 m, 90 % of the edges with a path at most 1.3 times as long (random ways: 70 %)."""
+    g, by_hand = strawberry
+    f = derived(g, method=method, **({"samples": 2500} if method == "roadmap" else {}))
+    network = check(g, f, 0.3)
+    nodes = by_hand.of_kind("node")
+    at = shapely.get_coordinates(nodes.geometry)[:, :2]
+    cell = cells_at(g, at)
+    free = g.cells[cell[:, 0], cell[:, 1]] == FREE
+    assert free.sum() == 182
+    # The network in pieces of 10 cm, so that ways may begin in the middle of an edge.
+    fine, places = nx.Graph(), [a for _, a in network.nodes(data="at")]
+    number = {n: k for k, n in enumerate(network)}
+    for a, b, length in nx.Graph(network).edges(data="length"):
+        steps = max(1, math.ceil(length / 0.1))
+        inner = [len(places) + k for k in range(steps - 1)]
+        p, q = np.array(places[number[a]]), np.array(places[number[b]])
+        places += [tuple(p + (q - p) * (k + 1) / steps) for k in range(steps - 1)]
+        chain = [number[a], *inner, number[b]]
+        fine.add_edges_from(itertools.pairwise(chain), length=length / steps)
+    tree = cKDTree(places)
+    near = tree.query(at[free])[0] <= 0.8
+    assert near.mean() >= 0.9
+    index = nodes.index()
+    good = total = 0
+    for edge in by_hand.of_kind("edge"):
+        a, b = (index[edge.properties[w]] for w in ("source", "target"))
+        if a == b or not (free[a] and free[b]):
+            continue
+        total += 1
+        straight = float(np.hypot(*(at[a] - at[b])))
+        # From the one to the network, along it, and to the other: all of it counts.
+        h = fine
+        for end, k in (("a", a), ("b", b)):
+            h.add_weighted_edges_from(
+                [(end, v, float(np.hypot(*(at[k] - places[v])))) for v in tree.query_ball_point(at[k], 0.8)],
+                weight="length",
+            )
+        try:
+            length, _ = nx.single_source_dijkstra(h, "a", "b", cutoff=1.3 * straight, weight="length")
+            good += length <= 1.3 * straight
+        except (nx.NetworkXNoPath, nx.NodeNotFound):
+            pass
+        h.remove_nodes_from(["a", "b"])
+    assert total == 413
+    assert good / total >= ways

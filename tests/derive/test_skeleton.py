@@ -1,0 +1,255 @@
+"""The thinning against scikit-image's, its graph against skan's idea of one, and the folder of compiled code."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import networkx as nx
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+from skimage.measure import euler_number, label
+from skimage.morphology import skeletonize
+
+from app.derive import Notes
+from app.derive import _kernels_skeleton as kernels
+from app.derive import _kernels_space as space_kernels
+from app.derive.occupancy_to_topology import Parameters, network
+from app.errors import CannotConvert
+from app.model.grid import FREE, OccupancyGrid
+from tests.derive.test_occupancy_to_topology import strawberry  # noqa: F401
+
+Mask = NDArray[np.bool_]
+
+
+def thinned(mask: Mask) -> Mask:
+    padded = np.pad(mask.astype(np.uint8), 1)
+    count = kernels.thin(padded)
+    assert count == padded.sum()
+    assert set(np.unique(padded)) <= {0, 1}
+    return np.asarray(padded[1:-1, 1:-1] == 1)
+
+
+def same_topology(skeleton: Mask, mask: Mask) -> None:
+    assert not (skeleton & ~mask).any()
+    assert label(skeleton, connectivity=2).max() == label(mask, connectivity=2).max(), "pieces"
+    assert euler_number(skeleton, 2) == euler_number(mask, 2), "holes"
+    library = skeletonize(mask)
+    assert label(skeleton, connectivity=2).max() == label(library, connectivity=2).max()
+    assert euler_number(skeleton, 2) == euler_number(library, 2)
+
+
+def one_cell_wide(skeleton: Mask) -> None:
+    """No cell but an end can go without changing pieces or holes: told cell by cell with the library."""
+    padded = np.pad(skeleton, 1)
+    for y, x in np.argwhere(padded):
+        around = padded[y - 1 : y + 2, x - 1 : x + 2].copy()
+        if around.sum() <= 2:
+            continue
+        around[1, 1] = False
+        holes = label(~np.pad(around, 1), connectivity=1).max()
+        cut = label(around, connectivity=2).max() > 1
+        # A cell whose four sides are all set encloses nothing when it stays and a hole when it goes.
+        opened = holes > 1
+        assert cut or opened, (y, x)
+
+
+def masks(count: int) -> list[Mask]:
+    random = np.random.default_rng(7)
+    out = []
+    for k in range(count):
+        shape = random.integers(1, 60, 2)
+        mask = random.random(shape) < random.choice([0.05, 0.2, 0.5, 0.7, 0.9, 0.97])
+        if k % 3 == 1:
+            mask = np.kron(mask, np.ones((4, 4))) > 0
+        elif k % 3 == 2:
+            mask = ndimage.gaussian_filter(random.random((80, 90)), random.uniform(1, 4)) > 0.5
+        out.append(mask)
+    return out
+
+
+def test_random_masks_keep_their_topology_as_the_library_keeps_it() -> None:
+    for mask in masks(240):
+        same_topology(thinned(mask), mask)
+
+
+def test_lines_are_one_cell_wide() -> None:
+    for mask in masks(36):
+        one_cell_wide(thinned(mask))
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        *(np.ones(shape) for shape in ((1, 1), (2, 2), (50, 50), (2, 30))),
+        *(np.eye(9), np.indices((9, 9)).sum(0) % 2, np.kron(np.eye(9), np.ones((2, 2))), np.zeros((4, 4))),
+    ],
+)
+def test_special_masks(mask: Any) -> None:
+    same_topology(thinned(mask > 0), mask > 0)
+
+
+def test_before_the_last_step_it_is_zhang_and_suen_cell_for_cell() -> None:
+    """Against the rules of the paper, written down plainly."""
+
+    around = ((1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1), (0, 1), (1, 1))
+
+    def plain(mask: Mask) -> Mask:
+        p = np.pad(mask, 1).astype(np.uint8)
+        while True:
+            deleted = 0
+            for odd in (True, False):
+                n = [np.roll(p, s, (0, 1)) for s in around]
+                total = sum(v.astype(int) for v in n)
+                rises = sum(((n[k] == 0) & (n[(k + 1) % 8] == 1)).astype(int) for k in range(8))
+                north, east, south, west = n[0], n[2], n[4], n[6]
+                first, second = (east * south * (north | west)), (north * west * (east | south))
+                go = (p == 1) & (total >= 2) & (total <= 6) & (rises == 1) & ((first if odd else second) == 0)
+                deleted += int(go.sum())
+                p[go] = 0
+            if not deleted:
+                return np.asarray(p[1:-1, 1:-1] == 1)
+
+    for mask in masks(90):
+        expected = plain(mask)
+        mine = thinned(mask)
+        # Ours goes one step further (redundant cells) and keeps lone 2 × 2 blocks, which the paper's rules delete.
+        extra = mine & ~expected
+        blocks = label(mask, connectivity=2)
+        gone = set(np.unique(blocks[mask])) - set(np.unique(blocks[expected]))
+        assert set(np.unique(blocks[extra])) <= gone
+        assert len(np.argwhere(extra)) == len(gone)
+
+
+def test_the_real_map(strawberry: Any) -> None:  # noqa: F811
+    free = strawberry[0].cells == FREE
+    same_topology(thinned(free), free)
+
+
+def test_distances_are_exact() -> None:
+    random = np.random.default_rng(3)
+    for _ in range(20):
+        free = np.pad((random.random(random.integers(2, 60, 2)) < 0.93).astype(np.uint8), 1)
+        gap = np.empty(free.shape, np.uint16)
+        space_kernels.gaps(free, gap)
+        expected = ndimage.distance_transform_edt(free)
+        cells = np.argwhere(free)
+        got = np.zeros(len(cells))
+        space_kernels.clearances(gap, cells, got)
+        assert np.allclose(got, expected[free == 1])
+        for radius in (0.0, 0.5, 1.0, 1.5, 2.3, 5.0):
+            out = np.empty_like(free)
+            count = space_kernels.erode(gap, radius**2, out)
+            assert (out == (expected > radius)).all()
+            assert count == out.sum()
+
+
+def test_lines_visit_every_cell_they_touch() -> None:
+    """Against shapely: a line is clear where it touches no blocked cell, be it at a corner."""
+    import shapely
+
+    random = np.random.default_rng(5)
+    mask = np.pad((random.random((30, 30)) < 0.9).astype(np.uint8), 1)
+    blocked = shapely.union_all([shapely.box(x - 0.5, y - 0.5, x + 0.5, y + 0.5) for y, x in np.argwhere(mask == 0)])
+    seen = set()
+    for y0, x0, y1, x1 in random.integers(1, 31, (600, 4)):
+        line = shapely.LineString([(x0, y0), (x1, y1)]) if (y0, x0) != (y1, x1) else shapely.Point(x0, y0)
+        expected = not shapely.intersects(blocked, line)
+        if bool(space_kernels.clear(mask, y0, x0, y1, x1)) != expected:
+            pytest.fail(f"{(y0, x0, y1, x1)}: {expected}")
+        seen.add(expected)
+    assert seen == {True, False}
+
+
+def network_of(graph: Any) -> nx.MultiGraph:
+    nodes, start, end, begin, _ = graph
+    g = nx.MultiGraph()
+    g.add_nodes_from(range(len(nodes)))
+    for e, (a, b) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
+        g.add_edge(a, b, cells=int(begin[e + 1] - begin[e]))
+    return g
+
+
+def test_the_graph_is_the_skeleton() -> None:
+    """As many pieces and loops as the skeleton has pieces and holes, and its paths are all of its cells."""
+    for mask in masks(90):
+        skeleton = thinned(mask)
+        padded = np.pad(skeleton.astype(np.uint8), 1)
+        cells = np.empty((int(padded.sum()), 2), np.int32)
+        rows = np.empty(len(padded) + 1, np.int64)
+        kernels.listed(padded, cells, rows)
+        assert (cells == np.argwhere(padded)).all()
+        graph = kernels.trace(padded, cells, rows)
+        nodes, start, end, begin, path = graph
+        g = network_of(graph)
+        assert nx.number_connected_components(g) == label(skeleton, connectivity=2).max()
+        assert set(nodes.tolist()) | set(path.tolist()) == set(range(len(cells)))
+        for e in range(len(start)):
+            way = cells[path[begin[e] : begin[e + 1]]]
+            assert (np.abs(np.diff(way, axis=0)).max(axis=1) == 1).all(), "each cell is next to the one before"
+            assert path[begin[e]] == nodes[start[e]]
+            assert path[begin[e + 1] - 1] == nodes[end[e]]
+        merged = kernels.contract(graph, np.full(padded.shape, 3, np.uint16) * padded, cells, 1.5)
+        assert nx.number_connected_components(network_of(merged)) == nx.number_connected_components(g)
+        for e in range(len(merged[1])):
+            way = cells[merged[4][merged[3][e] : merged[3][e + 1]]]
+            assert (np.abs(np.diff(way, axis=0)).max(axis=1) == 1).all()
+
+
+def test_hostile_shapes_end_quickly() -> None:
+    board = np.indices((300, 300)).sum(0) % 2 * 100
+    comb = np.full((300, 301), FREE)
+    comb[:-1, ::2] = 100
+    maze = np.full((301, 301), 100)
+    maze[1::2, 1:-1] = FREE
+    maze[2::4, -2], maze[4::4, 1] = FREE, FREE
+    for cells in (board, comb, maze):
+        for radius in (0.0, 0.01, 3.0):
+            grid = OccupancyGrid(cells.astype(np.uint8), 0.05)
+            try:
+                network(grid, Parameters(robot_radius=radius), Notes(), "it")
+            except CannotConvert:
+                assert radius > 0.04
+
+
+def test_compiled_code_is_read_from_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    """In a confined process, as on the server: filled before, read there; absent, compiled in memory."""
+    work = (
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from app.sandbox import Allowed, confine, supported\n"
+        "assert confine(Allowed()) or not supported()\n"
+        "import numpy as np\n"
+        "from app.derive import _kernels_roadmap as k\n"
+        "k.compile_all()\n"
+        "print(sum(k.spanner.stats.cache_hits.values()))\n"
+    )
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "native"), "PYTHONDONTWRITEBYTECODE": "1"}
+    told = subprocess.run([sys.executable, "-c", work], env=env, capture_output=True, text=True, check=True)
+    assert told.stdout.split() == ["0"]
+    fill = f"from pathlib import Path; from app.derive._native import fill; fill(Path({str(tmp_path / 'native')!r}))"
+    subprocess.run([sys.executable, "-c", fill], env=env, check=True)
+    before = sorted(p.name for p in (tmp_path / "native").rglob("*"))
+    assert any("spanner" in n for n in before)
+    told = subprocess.run([sys.executable, "-c", work], env=env, capture_output=True, text=True, check=True)
+    assert told.stdout.split() == ["1"]
+    assert sorted(p.name for p in (tmp_path / "native").rglob("*")) == before
+
+
+def test_a_damaged_folder_is_no_obstacle(tmp_path: Path) -> None:
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    work = "from app.derive import _kernels_roadmap as k; k.compile_all(); print('made')"
+    subprocess.run([sys.executable, "-c", work], env=env, check=True)
+    for file in tmp_path.rglob("*.nb?"):
+        file.write_bytes(b"nonsense")
+    told = subprocess.run([sys.executable, "-c", work], env=env, capture_output=True, text=True, check=True)
+    assert told.stdout.split() == ["made"]
+    told = subprocess.run(
+        [sys.executable, "-c", work], env={**env, "NUMBA_CACHE_DIR": "/proc/nowhere"}, capture_output=True, text=True
+    )
+    assert (told.returncode, told.stdout.split()) == (0, ["made"]), told.stderr
