@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 
@@ -31,6 +31,10 @@ TEMPLATE_FOLDERS = ("location", "metric", "topological", "world")
 """The folders of an environment_template's ``config``; the folder says what a drawing is meant for."""
 
 _FOLDER_LAYER: Mapping[str, Layer] = {"location": "location", "topological": "topology", "world": "objects"}
+
+VARIABLES_FILES = ("properties.sh", "environment.sh")
+
+_OF_FILES = re.compile(rf"^line \d+: ({'|'.join(sorted(_shell.OF_FILES))}) is left out: only a shell")
 
 DRAWN_LAYERS: tuple[Layer, ...] = ("objects", "topology", "location", "zones")
 
@@ -95,6 +99,7 @@ class Bundle:
     warnings: list[Problem] = field(default_factory=list)
     fence: shapely.Polygon | None = None
     notices: dict[str, str] = field(default_factory=dict)
+    inner: bool = False
 
     def credit(self, key: PartKey) -> tuple[str, ...]:
         """Licences and credits of a part: what its files say themselves, and the licence files of their folders."""
@@ -146,8 +151,8 @@ def _blamed_on(name: str) -> Iterator[None]:
         raise type(error)(f"{name}: {error.detail}", places) from error
 
 
-def read(files: Files, hints: Hints, known: Known, limits: Limits) -> Bundle:
-    """All files of an upload (already unpacked) -> what they say together.
+def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: bool = False) -> Bundle:
+    """All files of an upload (already unpacked) -> what they say together. inner: they are from one file of it.
 
     Raises BadUpload with every place that is wrong; Invalid for hints that cannot be used.
     """
@@ -155,7 +160,12 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits) -> Bundle:
         raise Invalid(f"layer must be one of {', '.join(DRAWN_LAYERS)}, got {hints.layer!r}")
     if not files:
         raise Invalid("the upload has no file: send at least one as form field 'files'")
-    bundle = Bundle(files={name: Use() for name in files})
+    if hints.format is not None and formats.get_format(hints.format).holds:
+        # A folder of other formats' maps is what any upload may be: each file is found out by its content.
+        held = [n for n in files if template_folder(n) or PurePosixPath(n).name in VARIABLES_FILES]
+        if held:
+            hints = dataclasses.replace(hints, format=None)
+    bundle = Bundle(files={name: Use() for name in files}, inner=inner)
     variables = _read_variables(files, bundle)
     groups, rest = _group({n: d for n, d in files.items() if n not in variables}, hints)
     bundle.notices = {name: text for name in rest if (text := _notice(name, files[name]))}
@@ -274,13 +284,14 @@ def _lacking(name: str, data: bytes) -> str:
 def _read_variables(files: Files, bundle: Bundle) -> set[str]:
     """Literal assignments of ``properties.sh`` and ``environment.sh``; they are read and never run."""
     variables: dict[str, str] = {}
-    names = sorted(n for n in files if PurePosixPath(n).name in ("properties.sh", "environment.sh") and files[n])
+    names = sorted(n for n in files if PurePosixPath(n).name in VARIABLES_FILES and files[n])
     for name in names:
         with _blamed_on(name):
             assigned, doubts = _shell.assignments(files[name])
-        variables.update(assigned)
+        variables.update({n: v for n, v in assigned.items() if v or n not in _shell.OF_FILES})
         bundle.files[name] = Use("environment", used=True)
-        bundle.warnings += [Problem(doubt, name) for doubt in doubts]
+        # Where the package's files lie is told anew whenever it is served: no loss worth a word.
+        bundle.warnings += [Problem(doubt, name) for doubt in doubts if not _OF_FILES.search(doubt)]
     if names:
         key = PartKey("objects", GROUND, "environment")
         empty = from_columns([], np.empty(0, object), [], "local", {"environment": {"variables": variables}})
@@ -308,7 +319,7 @@ def _set_aside(groups: list[Group], bundle: Bundle) -> list[Group]:
         elif (
             group.format.drawing
             and folder == "location"
-            and re.match(r"fence[_.]", PurePosixPath(name).name)
+            and PurePosixPath(name).name.startswith("fence_autogen.")
             and ("datum", "location") in kinds
         ):
             reason = "the fence comes from the datum file"
@@ -360,6 +371,7 @@ def _read_group(group: Group, hints: Hints, known: Known, limits: Limits, bundle
         wanted=None if group.format.drawing else known.wanted,
         cells=known.cells,
         whole=known.whole,
+        folder=_folder_reader(hints, known, limits, bundle),
     )
     layers = formats.read(group, context)
     for file in group.files:
@@ -377,6 +389,19 @@ def _read_group(group: Group, hints: Hints, known: Known, limits: Limits, bundle
             bundle.warnings.append(Problem("its datum differs from the one that is used", group.main))
     bundle.levels = join_levels(bundle.levels, [lv for lv in layers.levels if lv != Level()])
     return [Read(key, part, group) for key, part in parts.items() if not is_empty(part)]
+
+
+def _folder_reader(hints: Hints, known: Known, limits: Limits, bundle: Bundle) -> Callable[[Files], Layers] | None:
+    """What reads a folder inside one file of the upload (an archive that is no ``.zip``); one deep."""
+    if bundle.inner:
+        return None
+
+    def read_folder(files: Files) -> Layers:
+        inner = read(files, dataclasses.replace(hints, format=None), known, limits, inner=True)
+        bundle.warnings += inner.warnings
+        return inner.layers(None)
+
+    return read_folder
 
 
 def _assign(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
+from app.formats import _archive, all_formats
 from app.store import Store
 from tests.api.conftest import Api, running, settings_for
 from tests.postgres import Cluster
@@ -158,6 +159,30 @@ def test_a_whole_template_folder_is_one_version(api: Api, shared: Path, same: Sa
     if any("datum" in n for n in used):
         site = next(n for n in used if "datum" in n)
         assert same("datum", {"datum.yaml": files[site]}, served(api, env, "datum")) == []
+
+
+@pytest.mark.parametrize("name", TEMPLATES)
+def test_a_template_comes_back_as_a_package(api: Api, shared: Path, same: Same, name: str) -> None:
+    """Zipped in, zipped out: the same information, and the same content as the folder's files by themselves."""
+    root = shared / "data" / "environment_template" / name
+    files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+    env = f"zip-{name.replace('_', '-')}"
+    api.post("environments", {"name": env})
+    made = api.upload(env, {"site.zip": _archive.pack(files)}, format="environment").json()
+    loose = api.post("environments", {"name": f"{env}-loose"[:63]}).json()["name"]
+    assert api.upload(loose, files).json()["root"] == made["root"]
+    answer = api.get(f"/maps/{env}/environment")
+    assert answer.headers["content-type"] == "application/zip"
+    assert answer.headers["content-disposition"] == 'attachment; filename="environment.zip"'
+    assert api.get(f"/maps/{loose}/environment/environment.zip").content == answer.content
+    differences = same("environment", files, {"environment.zip": answer.content})
+    if "gazebo" in all_formats():
+        assert differences == []
+    else:
+        assert set(differences) <= {"world: lost"}, "no format reads Gazebo's worlds yet"
+    report = api.get(f"environments/{env}/versions/latest/reports/environment").json()
+    layers = {e["layer"] for e in api.get(f"environments/{env}/versions/latest/layers").json() if e["count"]}
+    assert {line["layer"] for line in report["layers"]} >= layers - {"resources"}
 
 
 def test_coordinates_agree_with_proj(api: Api, shared: Path, facts_json: dict[str, Any]) -> None:

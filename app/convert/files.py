@@ -11,11 +11,10 @@ from app import bundle, formats
 from app.bundle import Hints, Known
 from app.convert import make as making
 from app.convert import recipe as recipes
-from app.errors import CannotDerive, Invalid, MissingLayer, Problem
+from app.errors import Invalid, MissingLayer, Problem
 from app.formats import Files, Format, Limits
-from app.model.features import Features
 from app.model.frame import Datum
-from app.model.layers import Layer, Layers, PartKey
+from app.model.layers import Layer
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +51,9 @@ def offline(
     needed: frozenset[Layer] = known.needs.also.union(*known.needs.one_of)
     wanted = None if "objects" in needed else needed  # whatever can be read can be an object
     while True:
-        told = bundle.read(unpacked, hints, Known(datum, None, wanted, not known.outlines, known.drawing), limits)
+        told = bundle.read(
+            unpacked, hints, Known(datum, None, wanted, not known.outlines, known.drawing or known.holds), limits
+        )
         try:
             written = _made(known, told, datum, asked, derived=derived)
             break
@@ -67,23 +68,9 @@ def offline(
 def _made(
     known: Format, told: bundle.Bundle, datum: Datum | None, asked: Mapping[str, Any], *, derived: bool
 ) -> making.Written:
-    """By the cheapest way that works on these layers."""
+    credit = {key: told.credit(key) for key in told.parts}
     layers = told.layers(datum)
-    own = recipes.own_options(known, asked)
-    without: frozenset[str] = frozenset()
-    failed: list[str] = []
-    while True:
-        try:
-            way = recipes.chain(known, _stock(layers), own, derived=derived, values=asked, without=without)
-        except MissingLayer as error:
-            raise recipes.exhausted(error, failed) from error
-        kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
-        try:
-            credit = {key: told.credit(key) for key in told.parts}
-            return making.write(known, kept, asked, way, origin=told.origin, credit=credit)
-        except CannotDerive as error:
-            without |= {error.step}
-            failed.append(error.detail)
+    return making.from_layers(known, layers, asked, derived=derived, origin=told.origin, credit=credit)
 
 
 def offline_paths(
@@ -97,18 +84,3 @@ def offline_paths(
     """The same from spooled files: what a worker process is asked to do."""
     files = {name: path.read_bytes() for name, path in paths.items()}
     return offline(files, to, hints=hints, datum=datum, options=options, limits=limits)
-
-
-def _stock(layers: Layers) -> recipes.Stock:
-    keys: set[PartKey] = set()
-    blank: set[PartKey] = set()
-    anchors: dict[PartKey, frozenset[str]] = {}
-    for key, part in layers.parts.items():
-        if isinstance(part, Features):
-            if not len(part):
-                blank.add(key)
-                continue
-            some = {"local"} if part.local.any() else set()
-            anchors[key] = frozenset(some | ({"wgs84"} if part.needs_datum else set()))
-        keys.add(key)
-    return recipes.Stock(frozenset(keys), layers.datum is not None, anchors, frozenset(blank))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mimetypes
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,8 @@ from app import derive, formats
 from app.convert import recipe as recipes
 from app.convert.recipe import Chain
 from app.derive import Step
-from app.errors import CannotDerive, FleetMapError, Problem
-from app.formats import Format, WriteContext, _archive
+from app.errors import CannotDerive, FleetMapError, MissingLayer, Problem
+from app.formats import Format, Inner, WriteContext, _archive
 from app.model.features import Features
 from app.model.frame import GROUND
 from app.model.layers import LAYERS, VECTOR_LAYERS, Layer, Layers, PartKey
@@ -74,12 +74,17 @@ def write(
     notes = derive.Notes()
     made = derive.run(way.steps, layers, notes)
     context = WriteContext(options=recipes.own_options(known, values))
+    inner: list[dict[str, Any]] = []
+    if known.holds:
+        context.make = partial(_inner, entries, origin, credit, inner)
     chosen = known.choose(sorted(k for k in made.parts if k.layer in known.carries), context.options)
     used = Layers({k: made.parts[k] for k in chosen}, made.datum, made.levels)
     noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
     lines = _told(used, layers, way, entries or {}, origin or {}, noted)
     context.attribution = tuple(sorted(credits_of(lines)))  # whichever part came first: equal content, equal bytes
     files = formats.write(known, used, context)
+    known_lines = {(line["layer"], line["level"], line["name"]) for line in lines}
+    lines += [line for line in inner if (line["layer"], line["level"], line["name"]) not in known_lines]
     report = {
         "format": known.name,
         "layers": lines,
@@ -90,6 +95,58 @@ def write(
         "warnings": [p.as_dict() for p in notes.warnings + context.warnings],
     }
     return Written(files, report)
+
+
+def from_layers(
+    known: Format,
+    layers: Layers,
+    asked: Mapping[str, Any],
+    *,
+    derived: bool,
+    entries: Mapping[PartKey, PartEntry] | None = None,
+    origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None = None,
+    credit: Mapping[PartKey, Sequence[str]] | None = None,
+) -> Written:
+    """A map by the cheapest way that works on these layers. Raises what planning, deriving and writing raise."""
+    own = recipes.own_options(known, asked)
+    without: frozenset[str] = frozenset()
+    failed: list[str] = []
+    stock = recipes.stock_of(layers)
+    while True:
+        try:
+            way = recipes.chain(known, stock, own, derived=derived, values=asked, without=without)
+        except MissingLayer as error:
+            raise recipes.exhausted(error, failed) from error
+        kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
+        try:
+            return write(known, kept, asked, way, entries, origin, credit)
+        except CannotDerive as error:
+            without |= {error.step}
+            failed.append(error.detail)
+
+
+def _inner(
+    entries: Mapping[PartKey, PartEntry] | None,
+    origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None,
+    credit: Mapping[PartKey, Sequence[str]] | None,
+    derivations: list[dict[str, Any]],
+    name: str,
+    layers: Layers,
+    values: Mapping[str, Any],
+    derived: bool,
+) -> Inner:
+    """What ``WriteContext.make`` does; layers that were derived on the way are noted in ``derivations``."""
+    known = formats.get_format(name)
+    made = from_layers(known, layers, values, derived=derived, entries=entries, origin=origin, credit=credit)
+    report = made.report
+    derivations += [line for line in report["layers"] if line["information"] == "derived"]
+    return Inner(
+        made.files,
+        tuple(report["layers"]),
+        tuple(report["dropped"]),
+        tuple(report["template"]),
+        tuple(warnings_of(report)),
+    )
 
 
 def media_type(known: Format, name: str) -> str:

@@ -18,7 +18,8 @@ from app import __version__, derive, formats, parameters
 from app.derive import Step
 from app.errors import Invalid, MissingDatum, MissingLayer, Problem
 from app.formats import Format
-from app.model.layers import LAYERS, MAP, Layer, PartKey
+from app.model.features import Features
+from app.model.layers import LAYERS, MAP, Layer, Layers, PartKey
 from app.store.values import PartEntry, Version
 
 SUPPLY: Mapping[Layer, str] = {
@@ -97,6 +98,22 @@ def stock(version: Version) -> Stock:
     anchors = {e.key: frozenset(name for name, box in (e.bounds or {}).items() if box) for e in entries}
     blank = frozenset(e.key for e in version.parts if not e.count)
     return Stock(frozenset(e.key for e in entries), version.datum is not None, anchors, blank, pinned)
+
+
+def stock_of(layers: Layers) -> Stock:
+    """What layers at hand hold."""
+    keys: set[PartKey] = set()
+    blank: set[PartKey] = set()
+    anchors: dict[PartKey, frozenset[str]] = {}
+    for key, part in layers.parts.items():
+        if isinstance(part, Features):
+            if not len(part):
+                blank.add(key)
+                continue
+            some = {"local"} if part.local.any() else set()
+            anchors[key] = frozenset(some | ({"wgs84"} if part.needs_datum else set()))
+        keys.add(key)
+    return Stock(frozenset(keys), layers.datum is not None, anchors, frozenset(blank))
 
 
 def _pinned(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mapping[str, Mapping[str, Any]]]:
@@ -279,7 +296,7 @@ def own_options(known: Format, values: Mapping[str, str]) -> Any:
 
 
 def _key(version: Version, known: Format, options: Any, way: Chain, entries: Mapping[PartKey, PartEntry]) -> str:
-    ingredients = {
+    ingredients: dict[str, Any] = {
         "server": __version__,
         "format": [known.name, known.version],
         "options": parameters.canonical(options),
@@ -289,6 +306,9 @@ def _key(version: Version, known: Format, options: Any, way: Chain, entries: Map
         "datum": version.datum.as_dict() if version.datum else None,
         "levels": [[level.name, level.elevation] for level in version.levels],
     }
+    if known.holds:  # its bytes are those of other writers and, where they lack a layer, of derivations
+        ingredients["formats"] = [[f.name, f.version] for f in formats.all_formats().values()]
+        ingredients["derivations"] = [[d.name, d.version] for d in derive.all_derivations().values()]
     return hashlib.sha256(orjson.dumps(ingredients, option=orjson.OPT_SORT_KEYS)).hexdigest()
 
 

@@ -61,7 +61,8 @@ class ReadContext:
     wanted: the layers that will be used (None: all); a reader may leave others out. cells: whether anybody will look at
     the cells of grids; if not, a reader checks an image's header only. whole: whether anybody will ask for this format
     (or its family) back; if not, a reader may leave out what only it knows (``properties.<format>``, the document).
-    main: the file that was detected.
+    main: the file that was detected. folder: reads files that hold other formats' maps, as a folder of an upload is
+    read, for the formats that are such folders in one file; None inside one.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -74,6 +75,7 @@ class ReadContext:
     cells: bool = True
     whole: bool = True
     main: str = ""
+    folder: Callable[[Files], Layers] | None = None
     warnings: list[Problem] = field(default_factory=list)
 
     def warn(self, problem: str, *, file: str | None = None, line: int | None = None, where: str | None = None) -> None:
@@ -86,17 +88,34 @@ class ReadContext:
         return self.wanted is None or layer in self.wanted
 
 
+@dataclass(frozen=True, slots=True)
+class Inner:
+    """A map inside another one: its files, main file first, and what its writer declared (see ``WriteContext``).
+
+    layers: what the report says of each layer in it.
+    """
+
+    files: dict[str, bytes]
+    layers: tuple[Mapping[str, Any], ...] = ()
+    dropped: tuple[Mapping[str, Any], ...] = ()
+    template: tuple[Mapping[str, Any], ...] = ()
+    warnings: tuple[Problem, ...] = ()
+
+
 @dataclass(slots=True)
 class WriteContext:
     """What a writer is told, and where it declares what it lost or made up (loss is data).
 
     title: the environment's name, for formats with a place for one. options: the format's own write options.
-    attribution: licences and credits of the sources, for formats with a place for them.
+    attribution: licences and credits of the sources, for formats with a place for them. make: for formats that hold
+    others: a map of the named format from these layers, with these of its options, its missing layers derived or not;
+    it raises NotFound for a format that is not there, and what planning and writing raise.
     """
 
     title: str = "map"
     options: Any = None
     attribution: tuple[str, ...] = ()
+    make: Callable[[str, Layers, Mapping[str, Any], bool], Inner] | None = None
     dropped: list[dict[str, Any]] = field(default_factory=list)
     template: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[Problem] = field(default_factory=list)
@@ -155,7 +174,7 @@ class Format:
     those is a main file itself. lacking: what a file needs that may be such a map but does not say enough by itself (a
     picture without a place); empty for other files. completing: the read options that say it.
     looks_at: files of other maps of the upload that it looks into. named: the part (layer, name) that these options
-    ask for by name, if they do.
+    ask for by name, if they do. holds: it is a folder of other formats' maps.
     """
 
     name: str
@@ -182,6 +201,7 @@ class Format:
     outlines: bool = False
     joined: bool = False
     sort: Callable[[Files, Sequence[str]], Mapping[str, Iterable[str]]] | None = None
+    holds: bool = False
     check: Callable[[Files], Iterable[Problem]] | None = None
     yields: Callable[[str], bool] = lambda name: False
     lacking: Callable[[str, bytes], str] = lambda name, data: ""

@@ -19,6 +19,24 @@ MAX_VARIABLES = 1000
 MAX_VALUE = 32 * 2**10
 MAX_WARNINGS = 100
 
+OF_FILES = frozenset(
+    {
+        "BASH_SOURCE",
+        "CONFIG_DIR",
+        "CONF",
+        "PROPERTIES_FILE",
+        "DATUM_FILE",
+        "TMAP_FILE",
+        "POI_FILE",
+        "GAZEBO_WORLD_FILE",
+        "GAZEBO_CUSTOM_MODELS",
+        "GAZEBO_MODEL_PATH",
+        "COSTMAP_YAML_FILE",
+        "NOGO_COSTMAP_YAML_FILE",
+    }
+)
+"""The template's variables that say where its files are. Source: environment_template and environment_common."""
+
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}(?![A-Za-z0-9_])")
 _EXPORT = re.compile(r"export(?=[ \t])")
 _BLANK = re.compile(r"[ \t]*")

@@ -1,0 +1,442 @@
+"""environment: a whole environment_template package as one archive, all that is known of a place in its folders.
+
+``config/location`` the datum, the fence and georeferenced pictures, ``config/metric/<grid>`` a map.yaml with its
+picture for each grid (``<name>/map.bt`` for voxels), ``config/topological`` the network, ``config/world`` the Gazebo
+world, points of interest and all other objects, ``config/properties.sh`` what the place is called and
+``config/environment.sh`` where its files are. Source: LCAS/environment_template, releases v1.0.x and older.
+
+Robots source the two scripts, so they are made anew and never copied: literal variables of an upload come back through
+``_shell.exports``, and the variables that name files are worked out by the script from where it lies, for the files
+that are there; as in the template those of maps that are missing are empty. The archive holds what is stored;
+``complete`` adds what derivations can make of it.
+
+Every map in it is another format's: reading is what an upload of the folder is (``app.bundle``), and writers come from
+``WriteContext.make``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from app.errors import CannotConvert, FleetMapError, MissingLayer, Problem, UnreadableFile
+from app.formats import Files, Format, Inner, Needs, ReadContext, WriteContext, _archive, _shell, register
+from app.formats._network import some
+from app.model.features import Features
+from app.model.frame import GROUND, Level
+from app.model.layers import LAYERS, MAP, NETWORK, Layer, Layers, Part, PartKey, is_empty
+from app.parameters import parameter
+
+NAME = "environment"
+MAIN = "environment.zip"
+CONFIG = "config"
+FOLDERS = ("location", "metric", "topological", "world")
+RELEASE = "ENVIRONMENT_COMMON_LATEST_RELEASE"
+"""The one literal that stands in environment.sh itself; all others are the place's properties."""
+
+NO_GO = ("nogo", "keepout")
+"""Names of the grid that NOGO_COSTMAP_YAML_FILE means."""
+
+_FOLDER_NAMES = tuple(f"{CONFIG}/{folder}/".encode() for folder in FOLDERS)
+_PATH = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.-]*)*/?")
+"""Paths as they may stand between double quotes in a script: nothing there means anything to a shell."""
+
+HELD: tuple[Layer, ...] = tuple(layer for layer in LAYERS if layer != "resources")
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What is put in beside what is stored."""
+
+    complete: bool = parameter(False, "also derive the network, the map and the world where no layer tells them")
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+def detect(name: str, data: bytes) -> bool:
+    """An archive with one of the template's folders in it."""
+    if name.lower().endswith(".kmz") or not _archive.is_archive(data):
+        return False
+    return any(folder in data for folder in _FOLDER_NAMES)
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """What the folder in the archive says, as if its files had been uploaded. Raises what their readers raise."""
+    if context.folder is None:
+        reason = "an environment package inside another one is not opened: upload it by itself"
+        raise UnreadableFile(reason, [Problem(reason)])
+    members = _archive.unpack(files[context.main or next(iter(files))], context.limits)
+    if not members:
+        raise UnreadableFile("the archive is empty", [Problem("the archive is empty")])
+    return context.folder(members)
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``environment.zip``. Raises MissingLayer where there is nothing to put into it."""
+    return {MAIN: _archive.pack(_Writer(layers, context).files())}
+
+
+class _Writer:
+    """The files of one package, by path from ``config`` on; which file the variables name."""
+
+    def __init__(self, layers: Layers, context: WriteContext) -> None:
+        if context.make is None:
+            raise CannotConvert("an environment package holds maps of other formats, and none can be made here")
+        self.layers, self.context, self.make = layers, context, context.make
+        self.complete = bool(getattr(context.options, "complete", False))
+        self.out: dict[str, bytes] = {}
+        self.paths: dict[str, str] = {}
+        self.told: set[PartKey] = set()
+
+    def files(self) -> dict[str, bytes]:
+        """All of them. Each layer's maps are made in turn; what a format cannot hold is told by path."""
+        self.location()
+        self.pictures()
+        self.grids()
+        self.voxels()
+        self.network()
+        self.world()
+        self.points()
+        self.objects()
+        variables = self.variables()
+        if not self.out and not variables:
+            raise MissingLayer("there is nothing to make an environment package of: supply a map of any kind")
+        self.left_over()
+        self.scripts(variables)
+        return {f"{CONFIG}/{path}": data for path, data in self.out.items()}
+
+    # --- one map ---
+
+    def made(
+        self, name: str, layers: Layers, values: Mapping[str, Any] | None = None, *, derived: bool = False
+    ) -> Inner | None:
+        """A map by another format's writer; None, with the reason in the report, where there is none."""
+        try:
+            return self.make(name, layers, values or {}, derived)
+        except FleetMapError as error:
+            self.context.warn(f"no {name} is in it: {error.detail}")
+        return None
+
+    def put(self, names: Mapping[str, str], inner: Inner, *, copy: bool = False) -> None:
+        """Take in a map's files. names: its name of a file -> path here. copy: another map tells the same, so that
+        what this one lost is no loss."""
+        for name, data in inner.files.items():
+            path = names[name]
+            if path in self.out and self.out[path] != data:
+                raise CannotConvert(f"two maps of the environment would both be {CONFIG}/{path}: rename one of them")
+            self.out[path] = data
+        main = f"{CONFIG}/{names[next(iter(inner.files))]}"
+        if not copy:
+            self.context.dropped += [{**line, "what": f"{main}: {line['what']}"} for line in inner.dropped]
+            self.context.template += [{**line, "what": f"{main}: {line['what']}"} for line in inner.template]
+        for problem in inner.warnings:
+            path_ = names.get(problem.file or "")
+            self.context.warnings.append(dataclasses.replace(problem, file=f"{CONFIG}/{path_}" if path_ else main))
+
+    def only(self, *layers: Layer) -> Layers:
+        """The stored parts of these layers."""
+        kept = {k: p for k, p in self.layers.parts.items() if k.layer in layers and not is_empty(p)}
+        return Layers(kept, self.layers.datum, self.layers.levels)
+
+    def with_parts(self, parts: Mapping[PartKey, Part]) -> Layers:
+        return Layers(dict(parts), self.layers.datum, self.layers.levels)
+
+    # --- the folders ---
+
+    def location(self) -> None:
+        site = self.only("location")
+        self.told.update(site.parts)
+        if self.layers.datum is not None:
+            # The grids say how large the map is.
+            inner = self.made("datum", self.only("location", "occupancy"))
+            if inner is not None:
+                self.put(dict.fromkeys(inner.files, "location/datum.yaml"), inner)
+                self.paths["DATUM_FILE"] = "location/datum.yaml"
+        if any(isinstance(part, Features) and len(part) for part in site.parts.values()):
+            inner = self.made("kml", _picture_of(site))
+            if inner is not None:
+                self.put(dict.fromkeys(inner.files, "location/fence.kml"), inner, copy="DATUM_FILE" in self.paths)
+
+    def pictures(self) -> None:
+        for key, part in self.layers.of("imagery").items():
+            inner = self.made("satellite", self.with_parts({key: part}))
+            if inner is None:
+                continue
+            self.told.add(key)
+            stem = self.stem(key, {k for k in self.layers.parts if k.layer == "imagery"})
+            self.put({n: f"location/{stem}{_ending(n)}" for n in inner.files}, inner)
+
+    def grids(self) -> None:
+        """Each grid in a folder of its name, which is how it is called when the folder is read."""
+        grids = self.layers.grids()
+        if not grids and self.complete:
+            inner = self.made("occupancy_grid", self.layers, derived=True)
+            if inner is not None:
+                self.put({n: f"metric/{MAP}/{n.rpartition('/')[2]}" for n in inner.files}, inner)
+                main = f"metric/{MAP}/{next(iter(inner.files)).rpartition('/')[2]}"
+                self.paths["COSTMAP_YAML_FILE"] = main
+        names: dict[str, list[str]] = {}
+        for key, grid in grids.items():
+            stem = self.stem(key, set(grids))
+            inner = self.made("occupancy_grid", self.with_parts({PartKey("occupancy", GROUND, MAP): grid}))
+            if inner is None:
+                continue
+            self.told.add(key)
+            self.put({n: f"metric/{stem}/{n}" for n in inner.files}, inner)
+            names.setdefault(key.name, []).append(f"metric/{stem}/{next(iter(inner.files))}")
+        chosen = names.get(MAP) or ([p for row in names.values() for p in row] if len(grids) == 1 else [])
+        if chosen:
+            self.paths["COSTMAP_YAML_FILE"] = chosen[0]
+        elif len(names) > 1:
+            self.context.warn(f"none of the grids {some(sorted(names))} is called {MAP}: COSTMAP_YAML_FILE is empty")
+        for name in NO_GO:
+            if name in names:
+                self.paths.setdefault("NOGO_COSTMAP_YAML_FILE", names[name][0])
+
+    def voxels(self) -> None:
+        keys = {k for k in self.layers.parts if k.layer == "voxels"}
+        for key in sorted(keys):
+            inner = self.made("octomap", self.with_parts({key: self.layers.parts[key]}))
+            if inner is not None:
+                self.told.add(key)
+                stem = self.stem(key, keys)
+                self.put({n: f"metric/{stem}/{n}" for n in inner.files}, inner)
+
+    def network(self) -> None:
+        networks = self.only("topology")
+        self.told.update(networks.parts)
+        if not networks.parts and not self.complete:
+            return
+        source = networks if networks.parts else self.only("objects", "occupancy", "imagery", "topology")
+        inner = self.made("tmap2", source, derived=not networks.parts)
+        if inner is None:
+            return
+        self.put(dict.fromkeys(inner.files, "topological/network.tmap2.yaml"), inner)
+        self.paths["TMAP_FILE"] = "topological/network.tmap2.yaml"
+        if networks.parts and (drawn := self.made("kml", _picture_of(networks))) is not None:
+            self.put(dict.fromkeys(drawn.files, "topological/network.kml"), drawn, copy=True)
+
+    def world(self) -> None:
+        """The stored worlds, each under its own name; else one of what is stored, where that is asked for."""
+        mine = {k: p for k, p in self.layers.vector("objects").items() if k.name == "gazebo"}
+        worlds: dict[str, dict[str, Any]] = {}
+        for part in mine.values():
+            said = part.document.get("gazebo")
+            stored = said.get("worlds") if isinstance(said, Mapping) else None
+            worlds |= {str(name): {"world": str(name)} for name in stored} if isinstance(stored, Mapping) else {}
+        if mine and not worlds:
+            worlds = {"gazebo": {}}
+        if not mine and self.complete:
+            worlds = {"gazebo": {}}
+        first: list[str] = []
+        for name, values in worlds.items():
+            inner = self.made("gazebo", self.only("objects", "resources", "occupancy"), values, derived=not mine)
+            if inner is None:
+                continue
+            self.told.update(mine)
+            self.told.update(k for k in self.layers.parts if k.layer == "resources" and k.name == "gazebo")
+            main, *others = inner.files
+            path = f"world/{_world_name(name)}"
+            paths = {n: f"world/custom_models/{n.removeprefix('models/')}" for n in others}
+            self.put({main: path, **paths}, inner)
+            first.append(path)
+            if others:
+                self.paths["GAZEBO_CUSTOM_MODELS"] = "world/custom_models/"
+        if first:
+            # As the template looks for it, else as a folder with one world has it.
+            best = min(first, key=lambda p: (not p.startswith("world/gazebo"), len(p), p))
+            self.paths["GAZEBO_WORLD_FILE"] = best
+
+    def points(self) -> None:
+        """Points of interest of a topological map: a map of nodes without edges."""
+        mine = {k: p for k, p in self.layers.vector("objects").items() if k.name == "tmap2" and len(p)}
+        for key, part in mine.items():
+            nodes = tuple({**p, "kind": "node"} for p in part.properties)
+            network = Features(part.ids, part.geometry, nodes, part.local, part.document)
+            inner = self.made("tmap2", self.with_parts({PartKey("topology", key.level, NETWORK): network}))
+            if inner is None:
+                continue
+            self.told.add(key)
+            path = "world/poi.tmap2.yaml" if key.level == GROUND else f"world/poi_{_plain(key.level)}.tmap2.yaml"
+            self.put(dict.fromkeys(inner.files, path), inner)
+            self.paths.setdefault("POI_FILE", path)
+
+    def objects(self) -> None:
+        """Objects by the format they came from; those of no format, and zones, in one that says where they belong."""
+        rest: dict[PartKey, Part] = {k: p for k, p in self.only("zones").parts.items() if isinstance(p, Features)}
+        families: dict[str, dict[PartKey, Part]] = {}
+        for key, part in self.layers.vector("objects").items():
+            if len(part) and key not in self.told:
+                families.setdefault(key.name, {})[key] = part
+        for family, parts in families.items():
+            inner = self.family(family, parts)
+            if inner is None:
+                rest |= parts
+                continue
+            main, *others = inner.files
+            names = {n: f"world/{_plain(family)}/{n}" for n in inner.files}
+            if not others:
+                end = _ending(main)
+                names[main] = f"world/objects{'' if end == '.' + family else '_' + _plain(family)}{end}"
+            self.put(names, inner)
+            self.told.update(parts)
+            self.told.update(k for k in self.layers.parts if k.layer == "resources" and k.name == family)
+        if rest:
+            inner = self.made("geojson", self.with_parts(rest))
+            if inner is not None:
+                self.put(dict.fromkeys(inner.files, "world/objects.geojson"), inner)
+                self.told.update(rest)
+
+    def family(self, name: str, parts: Mapping[PartKey, Part]) -> Inner | None:
+        """A map of the format that these objects came from; None where they cannot be all of it."""
+        resources = {k: p for k, p in self.layers.parts.items() if k.layer == "resources" and k.name == name}
+        try:
+            return self.make(name, self.with_parts({**parts, **resources}), {}, False)
+        except FleetMapError:
+            pass
+        try:
+            networks = self.only("topology").parts
+            return self.make(name, self.with_parts({**parts, **resources, **networks}), {}, False)
+        except FleetMapError:
+            return None
+
+    def left_over(self) -> None:
+        """Tell what no file of the package holds."""
+        for key, part in sorted(self.layers.parts.items()):
+            if key in self.told or is_empty(part) or key.name == NAME:
+                continue
+            count = len(part) if isinstance(part, Features) else 1
+            if count:
+                where = f"{key.layer} {key.level}/{key.name}"
+                self.context.drop(where, count, "no format that could hold it is there, or its map cannot be made")
+        levels = {k.level for k in self.told if k.layer in ("occupancy", "voxels", "imagery")} - {GROUND}
+        self.context.drop("levels of grids and pictures", len(levels), "the template's folders know one level")
+        if self.layers.levels != (Level(),):
+            more = sum(level != Level() for level in self.layers.levels)
+            self.context.drop("elevations of levels", more, "the template's folders know one level")
+
+    def stem(self, key: PartKey, all_keys: set[PartKey]) -> str:
+        """A part's name as a folder's: on the ground its own, elsewhere with its level; never two alike."""
+        mine = {k: _plain(k.name if k.level == GROUND else f"{k.name}_{k.level}") for k in sorted(all_keys)}
+        taken: set[str] = set()
+        for k, name in mine.items():
+            new, number = name, 2
+            while new in taken:
+                new, number = f"{name}_{number}", number + 1
+            taken.add(new)
+            mine[k] = new
+        return mine[key]
+
+    # --- the scripts ---
+
+    def variables(self) -> dict[str, str]:
+        """Stored variables but for those that say where files are."""
+        out: dict[str, str] = {}
+        for key, part in self.layers.vector("objects").items():
+            said = part.document.get(NAME) if key.name == NAME else None
+            values = said.get("variables") if isinstance(said, Mapping) else None
+            for name, value in values.items() if isinstance(values, Mapping) else ():
+                out |= {name: value} if isinstance(name, str) and isinstance(value, str) else {}
+        own = [name for name in out if name in _shell.OF_FILES]
+        self.context.drop("variables that name files", len(own), f"they name those of the package now: {some(own)}")
+        left: dict[str, str] = {}
+        for name, value in out.items():
+            if name in own:
+                continue
+            try:
+                _shell.exports({name: value})
+            except ValueError as error:
+                self.context.drop("variables", 1, str(error))
+            else:
+                left[name] = value
+        return left
+
+    def scripts(self, variables: Mapping[str, str]) -> None:
+        properties = {n: v for n, v in variables.items() if n != RELEASE}
+        release = {n: v for n, v in variables.items() if n == RELEASE}
+        head = b"# What this environment is called. Sourced by environment.sh.\n"
+        self.out["properties.sh"] = head + _shell.exports(properties)
+        lines = [
+            "# Where the maps of this environment are: source this file in bash.",
+            *_shell.exports(release).decode().splitlines(),
+            "",
+            'CONFIG_DIR=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)',
+            self.path("PROPERTIES_FILE", "properties.sh"),
+            '. "$PROPERTIES_FILE"',
+            "",
+        ]
+        always = ("DATUM_FILE", "TMAP_FILE", "GAZEBO_WORLD_FILE", "COSTMAP_YAML_FILE")
+        lines += [self.path(name, self.paths.get(name)) for name in always]
+        sometimes = ("NOGO_COSTMAP_YAML_FILE", "POI_FILE")
+        lines += [self.path(name, self.paths[name]) for name in sometimes if name in self.paths]
+        if "GAZEBO_CUSTOM_MODELS" in self.paths:
+            lines.append(self.path("GAZEBO_CUSTOM_MODELS", self.paths["GAZEBO_CUSTOM_MODELS"]))
+            lines.append('export GAZEBO_MODEL_PATH="${GAZEBO_MODEL_PATH:+$GAZEBO_MODEL_PATH:}$GAZEBO_CUSTOM_MODELS"')
+        self.out["environment.sh"] = "\n".join([*lines, ""]).encode()
+
+    def path(self, name: str, path: str | None) -> str:
+        """A line that exports a path inside the package, wherever it lies; an empty one where there is no such file."""
+        if path is None:
+            return f"export {name}=''"
+        there = path in self.out or path == "properties.sh" or any(n.startswith(path) for n in self.out)
+        if not _PATH.fullmatch(path) or not there:
+            raise ValueError(f"{name} would name {path!r}, which is no file of the package")
+        return f'export {name}="$CONFIG_DIR/{path}"'
+
+
+def _picture_of(layers: Layers) -> Layers:
+    """The same for people to look at: without what only its own format knows, which stands in that format's file."""
+    parts: dict[PartKey, Part] = {}
+    for key, part in layers.parts.items():
+        if isinstance(part, Features):
+            order = sorted(range(len(part)), key=part.ids.__getitem__)
+            kept = part.take(order)
+            plain = tuple({n: v for n, v in p.items() if not isinstance(v, Mapping)} for p in kept.properties)
+            said = {n: v for n, v in part.document.items() if n == "attribution"}
+            parts[key] = Features(kept.ids, kept.geometry, plain, kept.local, said)
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def _plain(name: str) -> str:
+    """A name as one folder's or file's: letters, digits, ``_``, ``.`` and ``-``."""
+    plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", name).lstrip(".-")[:64]
+    return plain or "unnamed"
+
+
+def _world_name(name: str) -> str:
+    """What a world's file is called: as it was, with an ending that says what it is."""
+    stem = _plain(name.rpartition("/")[2])
+    return stem if stem.endswith((".world", ".world.xml", ".sdf")) else f"{stem}.world.xml"
+
+
+def _ending(name: str) -> str:
+    """``.tif``, ``.pgw``, ``.png.aux.xml``: all behind the first point."""
+    base = name.rpartition("/")[2]
+    return base[base.index(".") :] if "." in base else ""
+
+
+register(
+    Format(
+        name=NAME,
+        title="environment_template package (all maps of a place)",
+        files=(MAIN,),
+        media_types=("application/zip",),
+        carries=frozenset(LAYERS),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(tuple(frozenset({layer}) for layer in HELD)),
+        write_options=WriteOptions,
+        family=NAME,
+        rank=70,
+        extensions=(".zip",),
+        holds=True,
+    )
+)

@@ -1,0 +1,386 @@
+"""environment: all maps of a place in one archive, scripts whose paths are there, and the same information back."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from app import bundle, formats
+from app.bundle import Bundle, Hints, Known
+from app.convert import make as making
+from app.convert import offline, recipe
+from app.errors import BadUpload, CannotConvert, MissingLayer
+from app.formats import Limits, WriteContext, _archive, _shell, all_formats, get_format
+from app.formats.environment import MAIN, detect
+from app.model.features import Features, features, from_columns
+from app.model.frame import Datum, Level
+from app.model.grid import OccupancyGrid
+from app.model.layers import Layers, Part, PartKey
+
+FORMAT = get_format("environment")
+SAMPLE = (Path(__file__).resolve().parents[1] / "samples/environment/yard.zip").read_bytes()
+DATUM = Datum(53.2686, -0.5245, heading=20.0)
+TEMPLATES = [
+    "indoor-agilex-limo-track",
+    "riseholme_park_farm_general_east_pathway",
+    "riseholme_park_farm_strawberry_polytunnels",
+    "riseholme_park_farm_vineyard",
+]
+Same = Callable[[str, dict[str, bytes], dict[str, bytes]], list[str]]
+
+
+def unzipped(data: bytes) -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        assert archive.testzip() is None
+        return {n: archive.read(n) for n in archive.namelist()}
+
+
+def folder(shared: Path, name: str) -> dict[str, bytes]:
+    root = shared / "data" / "environment_template" / name
+    return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def told(files: dict[str, bytes], name: str | None = None) -> Bundle:
+    return bundle.read(bundle.unpack(files, Limits()), Hints(name), Known(), Limits())
+
+
+def written(layers: Layers, **options: Any) -> tuple[dict[str, bytes], dict[str, Any]]:
+    made = making.from_layers(FORMAT, layers, options, derived=True)
+    return unzipped(made.files[MAIN]), made.report
+
+
+def grid(level: int = 0) -> OccupancyGrid:
+    return OccupancyGrid(np.full((3, 4), level, np.uint8), 0.5, (0.0, 0.0, 0.0))
+
+
+def variables_of(values: dict[str, str]) -> Features:
+    return from_columns([], np.empty(0, object), [], "local", {"environment": {"variables": values}})
+
+
+VARIABLES = PartKey("objects", "ground", "environment")
+
+
+def sourced(files: dict[str, bytes], where: Path) -> dict[str, str]:
+    """What a robot has after ``source config/environment.sh``: every exported variable, from a clean shell."""
+    for name, data in files.items():
+        (where / name).parent.mkdir(parents=True, exist_ok=True)
+        (where / name).write_bytes(data)
+    script = 'cd / && source "$1" && env -0'
+    shell = ["env", "-i", "PATH=/usr/bin:/bin", "bash", "--noprofile", "--norc", "-euo", "pipefail", "-c", script, "-"]
+    done = subprocess.run(
+        [*shell, str(where / "config/environment.sh")],
+        capture_output=True,
+        check=True,
+        timeout=60,
+    )
+    assert done.stderr == b""
+    said = dict(line.split("=", 1) for line in done.stdout.decode().split("\0") if line)
+    return {k: v for k, v in said.items() if k not in ("PATH", "PWD", "OLDPWD", "SHLVL", "_")}
+
+
+def check_paths(values: dict[str, str], where: Path) -> set[str]:
+    """Each variable that names a file names one that is there; the names of those."""
+    named = set()
+    for name, value in values.items():
+        if name.endswith(("_FILE", "_MODELS")) and value:
+            path = Path(value)
+            assert path.is_absolute()
+            assert path.is_dir() if name.endswith("_MODELS") else path.is_file(), f"{name}={value}"
+            assert where in path.parents
+            named.add(name)
+    return named
+
+
+# --- real environments ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", TEMPLATES)
+def test_real_environments_come_back_and_their_scripts_work(
+    shared: Path, same: Same, tmp_path: Path, name: str
+) -> None:
+    files = folder(shared, name)
+    known = json.loads((shared / "data/facts.json").read_text())["_environment_sh"][name]["literal_assignments"]
+    # The script itself is not among the samples; its literals are in the facts.
+    files["config/environment.sh"] = b"".join(b"export %s='%s'\n" % (k.encode(), v.encode()) for k, v in known.items())
+    made = offline(files, "environment", hints=Hints("environment"))
+    differences = same("environment", files, made.files)
+    if "gazebo" in all_formats():
+        assert differences == []
+    else:
+        assert set(differences) <= {"world: lost"}, "no format reads Gazebo's worlds yet"
+    inner = unzipped(made.files[MAIN])
+    where = tmp_path / "a folder 'with' $odd \"names\""[:22]
+    values = sourced(inner, where)
+    assert known.items() <= values.items()
+    named = check_paths(values, where)
+    expected = {"PROPERTIES_FILE"}
+    expected |= {"DATUM_FILE"} if any("location/datum" in n for n in files) else set()
+    expected |= {"TMAP_FILE"} if any(n.endswith("network.tmap2.yaml") for n in inner) else set()
+    expected |= {"COSTMAP_YAML_FILE"} if any("metric/map/map.yaml" in n for n in files) else set()
+    expected |= {"NOGO_COSTMAP_YAML_FILE"} if any("metric/nogo/nogo_map" in n for n in files) else set()
+    expected |= {"POI_FILE"} if any("poi.tmap2" in n for n in files) else set()
+    assert expected <= named
+    assert {"DATUM_FILE", "TMAP_FILE", "COSTMAP_YAML_FILE", "GAZEBO_WORLD_FILE"} <= values.keys(), "empty, not unset"
+
+
+def test_the_archive_means_what_the_folder_means(shared: Path) -> None:
+    name = TEMPLATES[-1]
+    files = folder(shared, name)
+    archive = _archive.pack({n: d for n, d in files.items() if d})
+    loose = told(files)
+    for upload in ({"a.zip": archive}, {"a.zip": archive, "LICENSE": b"free"}):
+        for said in (None, "environment"):
+            packed = told(upload, said)
+            assert packed.parts.keys() == loose.parts.keys()
+            assert packed.datum == loose.datum
+            assert {w.problem for w in packed.warnings} == {w.problem for w in loose.warnings}
+    other = told({"site.bin": archive}, "environment")
+    assert other.parts.keys() == loose.parts.keys()
+    assert other.datum == loose.datum
+
+
+def test_the_paths_of_the_archive_are_the_template_s(shared: Path) -> None:
+    files = folder(shared, "riseholme_park_farm_strawberry_polytunnels")
+    inner = unzipped(offline(files, "environment").files[MAIN])
+    assert {
+        "config/environment.sh",
+        "config/properties.sh",
+        "config/location/datum.yaml",
+        "config/location/fence.kml",
+        "config/metric/map/map.yaml",
+        "config/metric/bigmap/map.yaml",
+        "config/metric/nogo/map.yaml",
+        "config/topological/network.tmap2.yaml",
+        "config/topological/network.kml",
+    } <= inner.keys()
+    for folder_ in ("map", "bigmap", "nogo"):
+        assert b"image: map.pgm" in inner[f"config/metric/{folder_}/map.yaml"]
+
+
+# --- our own sample ------------------------------------------------------------------------------------------------
+
+
+def test_the_sample_is_detected_read_and_written_whole() -> None:
+    assert detect("yard.zip", SAMPLE)
+    assert not detect("yard.kmz", SAMPLE)
+    assert not detect("a.zip", _archive.pack({"doc.kml": b"<kml/>"}))
+    first = told({"yard.zip": SAMPLE}, "environment")
+    made = offline({"yard.zip": SAMPLE}, "environment", hints=Hints("environment"))
+    second = told(made.files, "environment")
+    assert second.datum == first.datum
+    assert second.parts.keys() == first.parts.keys()
+    for key, part in first.parts.items():
+        other = second.parts[key]
+        if isinstance(part, OccupancyGrid):
+            assert isinstance(other, OccupancyGrid)
+            assert (part.cells == other.cells).all()
+            assert part.origin == other.origin
+        elif isinstance(part, Features):
+            assert isinstance(other, Features)
+            assert sorted(part.ids) == sorted(other.ids), key
+
+
+def test_variables_come_back_as_they_are_and_never_run(tmp_path: Path) -> None:
+    made = offline({"yard.zip": SAMPLE}, "environment")
+    inner = unzipped(made.files[MAIN])
+    values = sourced(inner, tmp_path)
+    assert values["FARM_NAME"] == 'It\'s a "yard"; $(echo no)'
+    assert values["FIELD_NAME"] == ""
+    assert values["ENVIRONMENT_COMMON_LATEST_RELEASE"] == "v1.0.1"
+    assert values["DATUM_FILE"] == f"{tmp_path}/config/location/datum.yaml", "not the path on somebody's machine"
+    assert "variables that name files" in {d["what"] for d in made.report["dropped"]}
+    assert check_paths(values, tmp_path) == {
+        "PROPERTIES_FILE",
+        "DATUM_FILE",
+        "TMAP_FILE",
+        "COSTMAP_YAML_FILE",
+        "NOGO_COSTMAP_YAML_FILE",
+        "POI_FILE",
+    }
+    again = told(made.files).parts[VARIABLES]
+    assert isinstance(again, Features)
+    assert again.document["environment"]["variables"] == {
+        "ENVIRONMENT_COMMON_LATEST_RELEASE": "v1.0.1",
+        "FARM_NAME": 'It\'s a "yard"; $(echo no)',
+        "FIELD_NAME": "",
+        "FIELD_TYPE": "yard",
+    }, "what names files is worked out each time, also where there is none"
+
+
+def test_the_report_tells_of_every_map_in_it() -> None:
+    report = offline({"yard.zip": SAMPLE}, "environment").report
+    lines = {(line["layer"], line["name"]): line for line in report["layers"]}
+    assert lines["topology", "network"]["sources"] == ["config/topological/network.tmap2.yaml"]
+    assert {line["information"] for line in report["layers"]} == {"raw"}
+    assert ("occupancy", "nogo") in lines
+    assert any(d["what"].startswith("config/location/datum.yaml: ") for d in report["template"])
+    files = {w["file"] for w in report["warnings"]}
+    assert "config/metric/nogo/map.yaml" in files, "the turned grid of a map inside is told by its path here"
+
+
+# --- what is put in ------------------------------------------------------------------------------------------------
+
+
+def test_grids_get_folders_that_no_script_stumbles_over(tmp_path: Path) -> None:
+    names = ["map", "a b", "a/b", "../../etc", "$(rm -rf)", ".hidden", "Größe", "x" * 200]
+    parts: dict[PartKey, Part] = {PartKey("occupancy", "ground", n): grid(k) for k, n in enumerate(names)}
+    parts[PartKey("occupancy", "upstairs", "map")] = grid(50)
+    inner, report = written(Layers(parts, levels=(Level(), Level("upstairs", 3.0))))
+    yamls = [n for n in inner if n.endswith("/map.yaml")]
+    assert len(yamls) == len(names) + 1
+    assert all(n.split("/")[:2] == ["config", "metric"] and len(n.split("/")) == 4 for n in yamls)
+    assert {"config/metric/map/map.yaml", "config/metric/a_b/map.yaml", "config/metric/a_b_2/map.yaml"} <= set(yamls)
+    assert "config/metric/map_upstairs/map.yaml" in yamls
+    values = sourced(inner, tmp_path)
+    assert values["COSTMAP_YAML_FILE"] == f"{tmp_path}/config/metric/map/map.yaml"
+    assert {"levels of grids and pictures", "elevations of levels"} <= {d["what"] for d in report["dropped"]}
+
+
+def test_which_grid_is_the_costmap() -> None:
+    for names, chosen in (
+        (["lab"], "lab"),
+        (["lab", "map"], "map"),
+        (["lab", "yard"], None),
+        (["keepout", "map"], "map"),
+    ):
+        parts: dict[PartKey, Part] = {PartKey("occupancy", "ground", n): grid() for n in names}
+        inner, report = written(Layers(parts))
+        script = inner["config/environment.sh"].decode()
+        line = f'export COSTMAP_YAML_FILE="$CONFIG_DIR/metric/{chosen}/map.yaml"' if chosen else "COSTMAP_YAML_FILE=''"
+        assert line in script
+        assert any("COSTMAP_YAML_FILE is empty" in w["problem"] for w in report["warnings"]) == (chosen is None)
+        assert ("NOGO_COSTMAP_YAML_FILE" in script) == ("keepout" in names)
+
+
+def test_objects_stand_in_the_format_they_came_from() -> None:
+    box = shapely.box(0.0, 0.0, 1.0, 1.0)
+    kept: dict[PartKey, Part] = {
+        PartKey("objects", "ground", "kml"): features([("a", shapely.Point(-0.5, 53.2), {"kind": "poi"})], "wgs84"),
+        PartKey("objects", "ground", "made-by-hand"): features([("b", box, {"kind": "shed"})], "local"),
+        PartKey("zones", "ground", "zones"): features([("z", box, {"kind": "keepout"})], "local"),
+    }
+    inner, _ = written(Layers(kept, DATUM))
+    assert {"config/world/objects.kml", "config/world/objects.geojson"} <= inner.keys()
+    again = told({f"{k}": v for k, v in inner.items()})
+    for key, part in kept.items():
+        other = again.parts[key]
+        assert isinstance(part, Features)
+        assert isinstance(other, Features)
+        assert part.ids == other.ids
+        assert shapely.equals_exact(part.geometry, other.geometry, tolerance=1e-9).all()
+        assert (part.local == other.local).all()
+
+
+def test_a_missing_map_is_told_and_the_others_are_there() -> None:
+    """A network in metres without a datum: no drawing of it on earth, but the network itself."""
+    line = shapely.LineString([(0.0, 0.0), (5.0, 0.0)])
+    rows: list[tuple[str, Any, dict[str, Any]]] = [
+        ("a", shapely.Point(0.0, 0.0), {"kind": "node"}),
+        ("b", shapely.Point(5.0, 0.0), {"kind": "node"}),
+        ("a_b", line, {"kind": "edge", "source": "a", "target": "b"}),
+    ]
+    inner, report = written(Layers({PartKey("topology", "ground", "network"): features(rows, "local")}))
+    assert inner.keys() == {
+        f"config/{n}" for n in ("environment.sh", "properties.sh", "topological/network.tmap2.yaml")
+    }
+    assert any(w["problem"].startswith("no kml is in it: ") for w in report["warnings"])
+    assert b"DATUM_FILE=''" in inner["config/environment.sh"]
+
+
+def test_complete_derives_what_is_missing_and_says_so() -> None:
+    lines = [("l", shapely.LineString([(0.0, 0.0), (5.0, 0.0), (5.0, 5.0)]), {"kind": "path"})]
+    layers = Layers({PartKey("objects", "ground", "geojson"): features(lines, "local")}, DATUM)
+    inner, report = written(layers)
+    assert "config/topological/network.tmap2.yaml" not in inner
+    assert {line["information"] for line in report["layers"]} == {"raw"}
+    inner, report = written(layers, complete="true")
+    assert "config/topological/network.tmap2.yaml" in inner
+    made = [line for line in report["layers"] if line["information"] == "derived" and line["layer"] == "topology"]
+    assert [step["step"] for step in made[0]["steps"]] == ["objects_to_topology"]
+
+
+def test_nothing_is_no_environment() -> None:
+    with pytest.raises(MissingLayer, match="supply"):
+        written(Layers())
+    inner, _ = written(Layers({VARIABLES: variables_of({"FARM_NAME": "x"})}))
+    assert inner.keys() == {"config/environment.sh", "config/properties.sh"}
+    with pytest.raises(CannotConvert):
+        formats.write(FORMAT, Layers({VARIABLES: variables_of({"A": "x"})}), WriteContext())
+
+
+def test_odd_variables_are_left_out_and_told(tmp_path: Path) -> None:
+    odd = {
+        "LD_PRELOAD": "/evil.so",
+        "A B": "x",
+        "GOOD": "`touch x`$(touch y)\\",
+        "LINES": "a\nb",
+        "CONFIG_DIR": "/elsewhere",
+        "TMAP_FILE": "/nowhere",
+        "X;touch z": "1",
+    }
+    inner, report = written(Layers({VARIABLES: variables_of(odd), PartKey("occupancy", "ground", "map"): grid()}))
+    values = sourced(inner, tmp_path)
+    assert values["GOOD"] == odd["GOOD"]
+    assert values["TMAP_FILE"] == ""
+    assert "LD_PRELOAD" not in values
+    assert values["PROPERTIES_FILE"] == f"{tmp_path}/config/properties.sh"
+    assert sum(d["count"] for d in report["dropped"] if d["what"].startswith("variables")) == 6
+    assert not (set("xyz") & {p.name for p in tmp_path.iterdir()})
+
+
+def test_a_new_writer_of_an_inner_map_makes_a_new_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    version: Any = SimpleNamespace(datum=None, levels=())
+    way = recipe.Chain((), ())
+
+    def keys() -> list[str]:
+        return [recipe._key(version, get_format(n), None, way, {}) for n in ("environment", "datum")]
+
+    before = keys()
+    assert keys() == before
+    monkeypatch.setitem(formats._registry, "tmap2", replace(get_format("tmap2"), version=99))
+    after = keys()
+    assert after[0] != before[0]
+    assert after[1] == before[1]
+
+
+# --- bad input -----------------------------------------------------------------------------------------------------
+
+
+def test_bad_packages_are_refused_with_file_and_reason() -> None:
+    inside = {"config/location/datum.yaml": b"datum_latitude: north\n"}
+    for upload in ({"a.zip": _archive.pack(inside)}, {"a.bin": _archive.pack(inside)}):
+        with pytest.raises(BadUpload) as caught:
+            told(upload, "environment")
+        assert caught.value.problems
+        assert all(p.file and p.problem for p in caught.value.problems)
+    with pytest.raises(BadUpload):
+        told({"a.bin": b"no archive"}, "environment")
+    with pytest.raises(BadUpload):
+        told({"a.zip": _archive.pack({"readme.txt": b"hello"})}, "environment")
+
+
+def test_packages_in_packages_are_opened_once() -> None:
+    middle = _archive.pack({"config/inner.pkg": SAMPLE, "config/properties.sh": b"export A='1'\n"})
+    once = told({"a.zip": middle})
+    assert PartKey("topology", "ground", "network") in once.parts
+    outer = _archive.pack({"config/metric/x/deep.pkg": middle})
+    with pytest.raises(BadUpload, match="inside another one"):
+        told({"a.pkg": _archive.pack({"config/metric/x/deep.pkg": outer})}, "environment")
+
+
+def test_of_files_are_the_variables_that_the_script_sets() -> None:
+    inner = unzipped(offline({"yard.zip": SAMPLE}, "environment").files[MAIN])
+    lines = inner["config/environment.sh"].decode().splitlines()
+    set_here = {line.removeprefix("export ").partition("=")[0] for line in lines if "=" in line}
+    assert set_here - {"ENVIRONMENT_COMMON_LATEST_RELEASE"} <= _shell.OF_FILES
