@@ -27,7 +27,8 @@ from app.formats import Files, Format, Inner, Needs, ReadContext, WriteContext, 
 from app.formats._network import some
 from app.model.features import Features
 from app.model.frame import GROUND, Level
-from app.model.layers import LAYERS, MAP, NETWORK, Layer, Layers, Part, PartKey, is_empty
+from app.model.layers import LAYERS, MAP, NETWORK, Layer, Layers, Part, PartKey, cloud_name, is_empty
+from app.model.voxels import VoxelMap
 from app.parameters import parameter
 
 NAME = "environment"
@@ -36,6 +37,9 @@ CONFIG = "config"
 FOLDERS = ("location", "metric", "topological", "world")
 RELEASE = "ENVIRONMENT_COMMON_LATEST_RELEASE"
 """The one literal that stands in environment.sh itself; all others are the place's properties."""
+
+CLOUDS = {"laz": "las"}
+"""Point clouds' endings that are not their format's name."""
 
 NO_GO = ("nogo", "keepout")
 """Names of the grid that NOGO_COSTMAP_YAML_FILE means."""
@@ -201,13 +205,24 @@ class _Writer:
                 self.paths.setdefault("NOGO_COSTMAP_YAML_FILE", names[name][0])
 
     def voxels(self) -> None:
+        """Each voxel map in a folder of its name, with the point cloud that it was made of."""
         keys = {k for k in self.layers.parts if k.layer == "voxels"}
         for key in sorted(keys):
-            inner = self.made("octomap", self.with_parts({key: self.layers.parts[key]}))
+            part = self.layers.parts[key]
+            stem = self.stem(key, keys)
+            inner = self.made("octomap", self.with_parts({key: part}))
             if inner is not None:
                 self.told.add(key)
-                stem = self.stem(key, keys)
                 self.put({n: f"metric/{stem}/{n}" for n in inner.files}, inner)
+            cloud = PartKey("resources", key.level, cloud_name(key.name))
+            said = part.properties.get("points") if isinstance(part, VoxelMap) else None
+            end = str(said.get("file")).rpartition(".")[2].lower() if isinstance(said, Mapping) else ""
+            if cloud not in self.layers.parts or not end:
+                continue
+            points = self.made(CLOUDS.get(end, end), self.with_parts({key: part, cloud: self.layers.parts[cloud]}))
+            if points is not None:
+                self.told.add(cloud)
+                self.put({n: f"metric/{stem}/points{_ending(n)}" for n in points.files}, points, copy=True)
 
     def network(self) -> None:
         networks = self.only("topology")
@@ -284,10 +299,12 @@ class _Writer:
             names = {n: f"world/{_plain(family)}/{n}" for n in inner.files}
             if not others:
                 end = _ending(main)
-                names[main] = f"world/objects{'' if end == '.' + family else '_' + _plain(family)}{end}"
+                plain = end in (f".{family}", ".kmz")
+                names[main] = f"world/objects{end}" if plain else f"world/objects_{_plain(family)}{end}"
             self.put(names, inner)
             self.told.update(parts)
-            self.told.update(k for k in self.layers.parts if k.layer == "resources" and k.name == family)
+            further = {family, "kmz"} if main.endswith(".kmz") else {family}
+            self.told.update(k for k in self.layers.parts if k.layer == "resources" and k.name in further)
         if rest:
             inner = self.made("geojson", self.with_parts(rest))
             if inner is not None:
@@ -296,7 +313,10 @@ class _Writer:
 
     def family(self, name: str, parts: Mapping[PartKey, Part]) -> Inner | None:
         """A map of the format that these objects came from; None where they cannot be all of it."""
-        resources = {k: p for k, p in self.layers.parts.items() if k.layer == "resources" and k.name == name}
+        names = (name, "kmz") if name == "kml" else (name,)
+        resources = {k: p for k, p in self.layers.parts.items() if k.layer == "resources" and k.name in names}
+        if any(k.name == "kmz" for k in resources):
+            name = "kmz"
         try:
             return self.make(name, self.with_parts({**parts, **resources}), {}, False)
         except FleetMapError:
