@@ -167,7 +167,8 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
             hints = dataclasses.replace(hints, format=None)
     bundle = Bundle(files={name: Use() for name in files}, inner=inner)
     variables = _read_variables(files, bundle)
-    groups, rest = _group({n: d for n, d in files.items() if n not in variables}, hints)
+    others = {n: d for n, d in files.items() if n not in variables}
+    groups, rest = _group(others, hints) if any(others.values()) or not variables else ([], sorted(others))
     bundle.notices = {name: text for name in rest if (text := _notice(name, files[name]))}
     taken = _set_aside(groups, bundle)
     _check_options(groups, hints)

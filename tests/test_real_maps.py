@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from app.formats import _archive, all_formats
+from app.formats import _archive
 from app.store import Store
 from tests.api.conftest import Api, running, settings_for
 from tests.postgres import Cluster
@@ -175,11 +175,7 @@ def test_a_template_comes_back_as_a_package(api: Api, shared: Path, same: Same, 
     assert answer.headers["content-type"] == "application/zip"
     assert answer.headers["content-disposition"] == 'attachment; filename="environment.zip"'
     assert api.get(f"/maps/{loose}/environment/environment.zip").content == answer.content
-    differences = same("environment", files, {"environment.zip": answer.content})
-    if "gazebo" in all_formats():
-        assert differences == []
-    else:
-        assert set(differences) <= {"world: lost"}, "no format reads Gazebo's worlds yet"
+    assert same("environment", files, {"environment.zip": answer.content}) == []
     report = api.get(f"environments/{env}/versions/latest/reports/environment").json()
     layers = {e["layer"] for e in api.get(f"environments/{env}/versions/latest/layers").json() if e["count"]}
     assert {line["layer"] for line in report["layers"]} >= layers - {"resources"}

@@ -211,18 +211,21 @@ class _Writer:
             part = self.layers.parts[key]
             stem = self.stem(key, keys)
             inner = self.made("octomap", self.with_parts({key: part}))
-            if inner is not None:
-                self.told.add(key)
-                self.put({n: f"metric/{stem}/{n}" for n in inner.files}, inner)
             cloud = PartKey("resources", key.level, cloud_name(key.name))
             said = part.properties.get("points") if isinstance(part, VoxelMap) else None
             end = str(said.get("file")).rpartition(".")[2].lower() if isinstance(said, Mapping) else ""
-            if cloud not in self.layers.parts or not end:
+            made_of = end if cloud in self.layers.parts else ""
+            if inner is not None:
+                self.told.add(key)
+                # Of two files with as much to say the shorter name is believed: the points, which the voxels lack.
+                name = "octomap" if made_of else MAP
+                self.put({n: f"metric/{stem}/{name}{_ending(n)}" for n in inner.files}, inner)
+            if not made_of:
                 continue
             points = self.made(CLOUDS.get(end, end), self.with_parts({key: part, cloud: self.layers.parts[cloud]}))
             if points is not None:
                 self.told.add(cloud)
-                self.put({n: f"metric/{stem}/points{_ending(n)}" for n in points.files}, points, copy=True)
+                self.put({n: f"metric/{stem}/cloud{_ending(n)}" for n in points.files}, points, copy=True)
 
     def network(self) -> None:
         networks = self.only("topology")
@@ -245,16 +248,27 @@ class _Writer:
         for part in mine.values():
             said = part.document.get("gazebo")
             stored = said.get("worlds") if isinstance(said, Mapping) else None
-            worlds |= {str(name): {"world": str(name)} for name in stored} if isinstance(stored, Mapping) else {}
+            worlds |= (
+                {str(name): {"world": str(name), "content": "world"} for name in stored}
+                if isinstance(stored, Mapping)
+                else {}
+            )
         if mine and not worlds:
             worlds = {"gazebo": {}}
         if not mine and self.complete:
             worlds = {"gazebo": {}}
         first: list[str] = []
         for name, values in worlds.items():
-            inner = self.made("gazebo", self.only("objects", "resources", "occupancy"), values, derived=not mine)
+            source = self.only("objects", "resources", "occupancy")
+            if mine:
+                kept = {k: p for k, p in source.parts.items() if k.name == "gazebo" and k.layer != "occupancy"}
+                source = self.with_parts(kept)
+            inner = self.made("gazebo", source, values, derived=not mine)
             if inner is None:
                 continue
+            # What one world lacks of another one stands in that one's file here.
+            others_ = {f"ask with world={other}" for other in worlds}
+            inner = dataclasses.replace(inner, dropped=tuple(d for d in inner.dropped if d["why"] not in others_))
             self.told.update(mine)
             self.told.update(k for k in self.layers.parts if k.layer == "resources" and k.name == "gazebo")
             main, *others = inner.files

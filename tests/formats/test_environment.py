@@ -21,7 +21,7 @@ from app.bundle import Bundle, Hints, Known
 from app.convert import make as making
 from app.convert import offline, recipe
 from app.errors import BadUpload, CannotConvert, MissingLayer
-from app.formats import Limits, WriteContext, _archive, _shell, all_formats, get_format
+from app.formats import Limits, WriteContext, _archive, _shell, get_format
 from app.formats.environment import MAIN, detect
 from app.model.features import Features, features, from_columns
 from app.model.frame import Datum, Level
@@ -114,11 +114,7 @@ def test_real_environments_come_back_and_their_scripts_work(
     # The script itself is not among the samples; its literals are in the facts.
     files["config/environment.sh"] = b"".join(b"export %s='%s'\n" % (k.encode(), v.encode()) for k, v in known.items())
     made = offline(files, "environment", hints=Hints("environment"))
-    differences = same("environment", files, made.files)
-    if "gazebo" in all_formats():
-        assert differences == []
-    else:
-        assert set(differences) <= {"world: lost"}, "no format reads Gazebo's worlds yet"
+    assert same("environment", files, made.files) == []
     inner = unzipped(made.files[MAIN])
     where = tmp_path / "a folder 'with' $odd \"names\""[:22]
     values = sourced(inner, where)
@@ -130,6 +126,10 @@ def test_real_environments_come_back_and_their_scripts_work(
     expected |= {"COSTMAP_YAML_FILE"} if any("metric/map/map.yaml" in n for n in files) else set()
     expected |= {"NOGO_COSTMAP_YAML_FILE"} if any("metric/nogo/nogo_map" in n for n in files) else set()
     expected |= {"POI_FILE"} if any("poi.tmap2" in n for n in files) else set()
+    expected |= {"GAZEBO_WORLD_FILE"} if any("/world/" in n and ".world" in n for n in files) else set()
+    if any(n.endswith("model.sdf") for n in files):
+        expected |= {"GAZEBO_CUSTOM_MODELS"}
+        assert values["GAZEBO_MODEL_PATH"] == values["GAZEBO_CUSTOM_MODELS"]
     assert expected <= named
     assert {"DATUM_FILE", "TMAP_FILE", "COSTMAP_YAML_FILE", "GAZEBO_WORLD_FILE"} <= values.keys(), "empty, not unset"
 
@@ -280,6 +280,19 @@ def test_objects_stand_in_the_format_they_came_from() -> None:
         assert part.ids == other.ids
         assert shapely.equals_exact(part.geometry, other.geometry, tolerance=1e-9).all()
         assert (part.local == other.local).all()
+
+
+def test_pictures_and_clouds_have_their_places() -> None:
+    samples = Path(__file__).resolve().parents[1] / "samples"
+    paths = [samples / "satellite/orchard.tif", samples / "pcd/shelf.pcd", samples / "octomap/shed.bt"]
+    files = {p.name: p.read_bytes() for p in paths}
+    made = offline(files, "environment", datum=DATUM)
+    inner = unzipped(made.files[MAIN])
+    wanted = ("location/orchard.tif", "metric/shelf/cloud.pcd", "metric/shelf/octomap.ot", "metric/shed/map.bt")
+    assert {f"config/{n}" for n in wanted} <= inner.keys()
+    assert inner["config/metric/shelf/cloud.pcd"] == files["shelf.pcd"]
+    assert offline(made.files, "environment", datum=DATUM).files == made.files
+    assert set(told(files).parts) <= told(made.files).parts.keys()
 
 
 def test_a_missing_map_is_told_and_the_others_are_there() -> None:

@@ -1416,10 +1416,41 @@ def sdf_cases() -> Iterator[Case]:
     yield Case("sdf/list tower", {"objects.yaml": inner, **tower, "custom_models/t0.yaml": inner}, "refused")
 
 
+def package_cases() -> Iterator[Case]:
+    """Packages of an environment whose parts are not what their places say."""
+    datum = b"datum_latitude: 53.2\ndatum_longitude: -0.5\n"
+    for name, inside, verdict in (
+        (
+            "script that runs",
+            {"config/environment.sh": b"export A=$(touch /tmp/owned)\nrm -rf /\n", "config/location/datum.yaml": datum},
+            "read",
+        ),
+        (
+            "grid without its picture",
+            {
+                "config/metric/map/map.yaml": b"image: ../../../etc/passwd\nresolution: 1\norigin: [0, 0, 0]\noccupied_thresh: 0.6\nfree_thresh: 0.2\nnegate: 0\n"
+            },
+            "refused",
+        ),
+        ("folder called as a file", {"config/location/datum.yaml/map.yaml": datum}, "read"),
+        ("nothing but scripts", {"config/properties.sh": b"export A='1'\n"}, "read"),
+        ("no map", {"config/location/notes.txt": b"hello"}, "refused"),
+        ("empty files", {"config/location/datum.yaml": b""}, "refused"),
+        ("damaged inner map", {"config/topological/network.tmap2.yaml": b"nodes: [" * 2000}, "refused"),
+    ):
+        for end in ("zip", "pkg"):
+            yield Case(f"package/{name} {end}", {f"a.{end}": zipped(inside)}, verdict, "environment")  # type: ignore[arg-type]
+    inner = {"config/location/datum.yaml": datum}
+    for _ in range(6):
+        inner = {"config/location/deeper.pkg": zipped(inner), "config/location/datum.yaml": datum}
+    yield Case("package/in a package in a package", {"a.pkg": zipped(inner)}, "refused", "environment")
+
+
 ACCORDING_TO_KIND = (
     yaml_cases,
     xml_cases,
     lanelet_cases,
+    package_cases,
     pbf_cases,
     json_cases,
     picture_cases,
