@@ -669,7 +669,9 @@ class _Writer:
         level = self.levels[name] = _Level()
         part = next((p for k, p in self.layers.vector("objects", name).items() if k.name == NAME), None)
         networks = self.layers.vector("topology", name)
-        nodes = {i for n in networks.values() for i, p in zip(n.ids, n.properties, strict=True) if p["kind"] == "node"}
+        nodes = {
+            i for n in networks.values() for i, p in zip(n.ids, n.properties, strict=True) if p.get("kind") == "node"
+        }
         if part is None or not len(part):
             return
         mixed = part.local.any() and not part.local.all()
