@@ -266,7 +266,8 @@ def _enclosed(edges: Array, group: NDArray[np.int64], layers: int, frame: Frame)
 def areas(polygons: Iterable[object], frame: Frame, *, touched: bool) -> Iterator[Spans]:
     """The cells that polygons (shapely, metres) enclose, and with ``touched`` also those that their outlines meet.
     The layer is 0. Lines and points count by the cells that they touch, in both cases."""
-    parts = shapely.get_parts(np.array(list(polygons), object))
+    # Twice: a collection may hold several polygons in one of its parts.
+    parts = shapely.get_parts(shapely.get_parts(np.array(list(polygons), object)))
     parts = parts[~shapely.is_empty(parts)]
     flat = shapely.get_type_id(parts) == 3
     rings, owner = shapely.get_rings(shapely.orient_polygons(parts[flat]), return_index=True)

@@ -33,7 +33,7 @@ MOST_FACES = 5_000_000
 """Triangles of one mesh. A real collision mesh has some thousands."""
 
 MOST_NODES = 100_000
-"""Nodes of a COLLADA scene, instances counted each time: they can be nested so that each level doubles them."""
+"""Elements of a COLLADA scene, instances counted each time: they can be nested so that each level doubles them."""
 
 DEEPEST = 64
 """Nodes of a COLLADA scene within each other, instances followed."""
@@ -274,9 +274,9 @@ class _Scene:
         visited = 0
         while stack:
             node, above, named, depth = stack.pop()
-            visited += 1
+            visited += 1 + len(node)
             if visited > MOST_NODES or depth > DEEPEST:
-                raise ValueError(f"its scene has more than {MOST_NODES} nodes, or {DEEPEST} within each other")
+                raise ValueError(f"its scene has more than {MOST_NODES} elements, or {DEEPEST} within each other")
             named = node.get("name") or node.get("id") or named
             here = above @ _transform(node)
             further: list[tuple[etree._Element, Array, str, int]] = []

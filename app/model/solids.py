@@ -26,7 +26,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import PurePosixPath
 from typing import Any, NoReturn
@@ -49,7 +49,10 @@ MOST_SHAPES = 10_000
 """Of one object."""
 
 MOST_PIXELS = 4097 * 4097
-"""Of a height map."""
+"""Of a height map's picture."""
+
+FINEST = 1400
+"""Rows and columns of a height map that are told apart: of a larger picture's neighbouring pixels the highest stays."""
 
 TOLERANCE = 0.002
 """Metres that a round solid's flat sides may lie within the true one."""
@@ -71,7 +74,7 @@ class Solids:
     resources: Mapping[str, bytes]
     planes: bool = False
     visuals: bool = False
-    _read: dict[str, meshes.Mesh | Invalid | None] | None = None
+    _read: dict[str, meshes.Mesh | Invalid] = field(default_factory=dict, init=False, repr=False)
 
     def triangles(self, properties: Properties) -> Array:
         """An object's solids as triangles, float64 [n, 3, 3], metres, local frame; counter-clockwise from outside where
@@ -125,8 +128,6 @@ class Solids:
 
     def mesh(self, file: str) -> meshes.Mesh:
         """A mesh file, read once. Raises Invalid that names it."""
-        if self._read is None:
-            self._read = {}
         if file not in self._read:
             try:
                 self._read[file] = meshes.read_mesh(self.file(file), file)
@@ -137,7 +138,6 @@ class Solids:
         known = self._read[file]
         if isinstance(known, Invalid):
             raise known
-        assert known is not None
         return known
 
     def file(self, path: str) -> bytes:
@@ -314,7 +314,7 @@ def _polyline(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:  #
 def extruded(area: Any, low: float, high: float) -> Array:
     """A polygon or several (shapely, metres), from one height to another, as closed triangles: float64 [n, 3, 3]."""
     found = []
-    for polygon in shapely.get_parts(area) if not shapely.is_empty(area) else ():
+    for polygon in shapely.get_parts(shapely.get_parts(area)):  # a collection may hold several polygons in one part
         if shapely.get_type_id(polygon) != 3 or shapely.is_empty(polygon):
             continue
         oriented = shapely.orient_polygons(polygon)
@@ -356,7 +356,7 @@ def _heightmap(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:
         _refuse("must be the path of a picture among the files of the objects", f"{where}.file")
     extent = _vector(shape, "size", 3, where, (1.0, 1.0, 1.0))
     position = _vector(shape, "position", 3, where, (0.0, 0.0, 0.0), least=-MAX_METRES)
-    grey = _picture(solids.file(file), file)
+    grey = _highest(_picture(solids.file(file), file))
     most = float(grey.max())
     z = grey[::-1] / (most or 1.0) * extent[2]
     rows, columns = z.shape
@@ -364,7 +364,8 @@ def _heightmap(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:
     top = np.stack([x, y, z], axis=-1)
     floor = top.copy()
     floor[..., 2] = z.min() - max(1e-3, 1e-3 * float(extent[2]))
-    parts = [_sheet(top), _sheet(floor)[:, ::-1]]
+    corners = floor[[[0, 0], [-1, -1]], [[0, -1], [0, -1]]]
+    parts = [_sheet(top), _sheet(corners)[:, ::-1]]
     for edge, base in (
         (top[0], floor[0]),
         (top[::-1, 0], floor[::-1, 0]),
@@ -373,6 +374,15 @@ def _heightmap(solids: Solids, shape: Mapping[str, Any], where: str) -> Array:
     ):
         parts.append(_sheet(np.stack([base, edge])))
     return np.asarray(np.concatenate(parts) + position, np.float64)
+
+
+def _highest(grey: Array) -> Array:
+    """A picture with at most FINEST rows and columns, each of its pixels the brightest of a block."""
+    step = [math.ceil(n / FINEST) for n in grey.shape]
+    if max(step) == 1:
+        return grey
+    rows, columns = (np.arange(0, n, k) for n, k in zip(grey.shape, step, strict=True))
+    return np.asarray(np.maximum.reduceat(np.maximum.reduceat(grey, rows, axis=0), columns, axis=1), np.float64)
 
 
 def _sheet(at: Array) -> Array:

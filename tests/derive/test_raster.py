@@ -158,6 +158,13 @@ def test_lines_and_points_and_what_lies_outside() -> None:
     assert not list(_raster.areas([], FRAME, touched=True))
 
 
+def test_collections_count_with_all_they_hold() -> None:
+    several = shapely.MultiPolygon([shapely.box(0, 0, 0.25, 0.25), shapely.box(1, 1, 1.25, 1.25)])
+    mixed = shapely.GeometryCollection([several, shapely.LineString([(2, 2.1), (2.4, 2.1)])])
+    assert cells(_raster.areas([mixed], FRAME, touched=True)).sum() == 4
+    assert len(solids.extruded(mixed, 0.0, 1.0)) == 2 * 12
+
+
 def test_frames_lie_on_whole_cells() -> None:
     frame = Frame.around((0.3, -0.31, 0.9, 0.6), 0.1)
     assert (frame.origin, frame.width, frame.height) == ((0.3, -0.4), 6, 10)

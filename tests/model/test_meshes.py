@@ -176,6 +176,14 @@ def nested(depth: int) -> bytes:
     return dae(ONE, '<node><instance_node url="#d0"/></node>', "1", f"<library_nodes>{nodes}{last}</library_nodes>")
 
 
+WIDE = dae(
+    "",
+    '<node><instance_node url="#w"/></node>' * 3000,
+    "1",
+    '<library_nodes><node id="w">' + '<instance_geometry url="#g"/>' * 3000 + "</node></library_nodes>",
+)
+"""Nine million times nothing."""
+
 LOOP = dae(
     ONE,
     '<node><instance_node url="#l"/></node>',
@@ -208,6 +216,7 @@ BOMB = (
         ("a.dae", b"<kml/>", "not COLLADA"),
         ("a.dae", b"<COLLADA>", "Premature end"),
         ("a.dae", LOOP, "within each other"),
+        ("a.dae", WIDE, "more than 100000 elements"),
         ("a.dae", nested(40), "within each other"),
         ("a.dae", dae(f"<polylist>{INPUT}<vcount>2147483647</vcount><p>0 1 2</p></polylist>", SHOWN), "does not fit"),
         ("a.dae", dae(f"<polylist>{INPUT}<vcount>-3 6</vcount><p>0 1 2</p></polylist>", SHOWN), "does not fit"),

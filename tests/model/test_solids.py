@@ -154,6 +154,19 @@ def test_a_height_map_is_closed_and_north_is_up() -> None:
     assert volume(deep) > 0
 
 
+def test_a_large_height_map_keeps_its_peaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(solids, "FINEST", 4)
+    rows = [[0] * 9 for _ in range(6)]
+    rows[0][8] = 100
+    rows[5][4] = 50
+    made = one({"type": "heightmap", "file": "h.png", "size": [3, 2, 10]}, {"h.png": picture(rows)})
+    assert len(made) == 2 * (3 - 1) * (3 - 1) + 2 + 2 * (2 + 2 + 2 + 2)
+    top = made.reshape(-1, 3)
+    assert top[top[:, 2] == 10][0].tolist() == [1.5, 1, 10]
+    assert top[top[:, 2] == 5][0].tolist() == [0, -1, 5]
+    assert volume(made) > 0
+
+
 def test_footprints() -> None:
     turned = {"shapes": [BOX], "pose": [10, 0, 0, 0, 0, math.pi / 2]}
     ground = solids.footprint(turned, {})
