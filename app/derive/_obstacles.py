@@ -31,8 +31,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes
-from app.errors import BadUpload, CannotConvert, Invalid, MissingDatum
-from app.model import solids
+from app.errors import BadUpload, CannotConvert, Invalid, MissingDatum, NotFound, Problem
+from app.model import solids, worlds
 from app.model.features import Features, Properties
 from app.model.layers import Layers
 
@@ -144,14 +144,28 @@ class Site:
         return low[0], low[1], high[0], high[1]
 
 
-def sites(layers: Layers, notes: Notes, *, doors_closed: bool = False, visuals: bool = False) -> dict[str, Site]:
-    """The sites of all levels that have objects. Raises MissingDatum where objects are places on earth without one."""
+def sites(
+    layers: Layers, notes: Notes, *, doors_closed: bool = False, visuals: bool = False, world: str | None = None
+) -> dict[str, Site]:
+    """The sites of all levels that have objects; of several worlds one (``app.model.worlds``).
+
+    Raises MissingDatum where objects are places on earth without one, Invalid where there is no such world.
+    """
     known = solids.Solids(layers.resources(), visuals=visuals)
     out: dict[str, Site] = {}
     reader = _Reader(layers, notes, known, doors_closed)
-    for key, part in layers.vector("objects").items():
-        if len(part):
-            reader.read(part, out.setdefault(key.level, Site()), key.level)
+    parts = {key: part for key, part in layers.vector("objects").items() if len(part)}
+    if world is not None and not any(worlds.names(part) for part in parts.values()):
+        raise Invalid("no world is stored", [Problem("no world is stored", where="world")])
+    for key, part in parts.items():
+        try:
+            one, others = worlds.chosen(part, world)
+        except NotFound as error:
+            raise Invalid(error.detail, [Problem(error.detail, where="world")]) from error
+        if others:
+            notes.warn(f"one world is looked at; ask for another one with world=: {', '.join(others)}")
+        if len(one):
+            reader.read(one, out.setdefault(key.level, Site()), key.level)
     reader.report()
     return {level: reader.finished(site, level) for level, site in out.items()}
 

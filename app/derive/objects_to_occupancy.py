@@ -68,6 +68,7 @@ class Parameters:
     )
     doors: Literal["open", "closed"] = parameter("open", "whether doors let a robot through")
     visuals: bool = parameter(False, "whether shapes that are only seen and collide with nothing count")
+    world: str | None = parameter(None, "which of several worlds; default: gazebo…, else the shortest name")
 
 
 @derives(
@@ -91,7 +92,8 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
     low, high = parameters.band or (height, height)
     if low > high:
         raise Invalid("band: the low height comes first", [Problem("the low height comes first", where="band")])
-    known = sites(layers, notes, doors_closed=parameters.doors == "closed", visuals=parameters.visuals)
+    closed, seen = parameters.doors == "closed", parameters.visuals
+    known = sites(layers, notes, doors_closed=closed, visuals=seen, world=parameters.world)
     around = fences(layers, notes)
     parts: dict[PartKey, Part] = {}
     reach: list[tuple[float, float]] = []

@@ -55,6 +55,7 @@ class Parameters:
     extrude: float = parameter(2.5, "how high footprints are that do not say it", minimum=0.0, maximum=1000.0, unit="m")
     doors: Literal["open", "closed"] = parameter("open", "whether doors let a robot through")
     visuals: bool = parameter(False, "whether shapes that are only seen and collide with nothing count")
+    world: str | None = parameter(None, "which of several worlds; default: gazebo…, else the shortest name")
 
 
 @derives(gives="voxels", needs={"objects"}, also=frozenset({"resources"}), parameters=Parameters, cost=6.0)
@@ -65,7 +66,8 @@ def objects_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> L
     MissingLayer where nothing has a body, MissingDatum where the objects are places on earth and there is none,
     CannotConvert where the map would be too large.
     """
-    known = sites(layers, notes, doors_closed=parameters.doors == "closed", visuals=parameters.visuals)
+    closed, seen = parameters.doors == "closed", parameters.visuals
+    known = sites(layers, notes, doors_closed=closed, visuals=seen, world=parameters.world)
     triangles: list[Array] = []
     guessed = 0
     for level, site in known.items():

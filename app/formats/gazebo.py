@@ -47,7 +47,7 @@ from app.formats import (
 )
 from app.formats._choice import the_one
 from app.formats._text import DEGREES, number
-from app.model import solids
+from app.model import solids, worlds
 from app.model.features import Feature, Features, features, unique_ids
 from app.model.frame import GROUND, Datum, is_writable
 from app.model.layers import Layers, PartKey, Resources
@@ -456,16 +456,7 @@ class _Stored:
 
     @property
     def rank(self) -> tuple[Any, ...]:
-        """Worlds before models and lists; ``gazebo.world`` before others; then the shortest name."""
-        name = _sdf.stem(self.key)
-        return (
-            not self.is_world,
-            "list" in self.entry,
-            not name.startswith("gazebo"),
-            self.key.count("/"),
-            len(name),
-            self.key,
-        )
+        return worlds.rank(self.key, self.entry)
 
 
 class _Writer:

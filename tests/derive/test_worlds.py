@@ -17,7 +17,9 @@ from app.derive import Notes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.derive.objects_to_voxels import Parameters as VoxelParameters
 from app.derive.objects_to_voxels import objects_to_voxels
+from app.errors import Invalid
 from app.formats import Limits
+from app.model.features import features
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
 from app.model.solids import Solids
@@ -139,3 +141,21 @@ def test_the_warehouse_as_voxels(shared: Path) -> None:
         flat[c:d, a:b] = 100
     differ = (flat == 100) != (grid.cells == 100)
     assert differ.sum() < 0.01 * (grid.cells == 100).sum(), "a layer of the octree is a band of the world"
+
+
+def test_of_several_worlds_one_is_cut(shared: Path) -> None:
+    root = shared / "data/gazebo_sdf/aws_small_warehouse"
+    files = [p for p in root.rglob("*") if p.is_file() and "maps" not in p.parts]
+    content = read({p.relative_to(root).as_posix(): p.read_bytes() for p in files})
+    notes = Notes()
+    objects_to_occupancy(content, Parameters(), notes)
+    assert any("world=" in w.problem and "no_roof" in w.problem for w in notes.warnings)
+    roof = sliced(content, band=(9.5, 10.5), world="small_warehouse")
+    assert (roof.cells == 100).mean() > 0.5
+    open_ = sliced(content, band=(9.5, 10.5), world="worlds/no_roof_small_warehouse")
+    assert (open_.cells == 100).mean() < 0.2, "lamps hang there"
+    with pytest.raises(Invalid, match=r"there is no world 'moon'; there are: .*small_warehouse"):
+        sliced(content, world="moon")
+    building = features([("a", shapely.box(0, 0, 1, 1), {"kind": "building"})], "local")
+    with pytest.raises(Invalid, match="no world is stored"):
+        sliced(Layers({PartKey("objects", "ground", "x"): building}), world="moon")

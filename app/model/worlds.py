@@ -1,0 +1,59 @@
+"""Several worlds of one upload lie side by side in one part of objects: which of them is meant.
+
+The part's ``document.gazebo.worlds`` lists them by the path of their file without its ending, each with what is known
+of it (``sdf``: its element; ``alone``: a lone model; ``list``: a generator's list); an object says its own under
+``properties.gazebo.world``. What says none belongs to each of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import PurePosixPath
+from typing import Any
+
+from app.errors import NotFound
+from app.model.features import Features, Properties
+
+FAMILY = "gazebo"
+
+
+def rank(name: str, entry: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Worlds before models and lists; ``gazebo.world`` before others; then the shortest name."""
+    base = PurePosixPath(name).name
+    alone = "sdf" not in entry or bool(entry.get("alone"))
+    return (alone, "list" in entry, not base.startswith("gazebo"), name.count("/"), len(base), name)
+
+
+def names(part: Features) -> list[str]:
+    """The worlds of a part, the one that is meant where nobody says so first."""
+    said = part.document.get(FAMILY)
+    known = said.get("worlds") if isinstance(said, Mapping) else None
+    if not isinstance(known, Mapping):
+        return []
+    used = {world_of(p) for p in part.properties}
+    there = {str(k): w for k, w in known.items() if isinstance(w, Mapping) and ("sdf" in w or str(k) in used)}
+    return sorted(there, key=lambda name: rank(name, there[name]))
+
+
+def world_of(properties: Properties) -> str | None:
+    """The world that an object belongs to; None: each."""
+    own = properties.get(FAMILY)
+    name = own.get("world") if isinstance(own, Mapping) else None
+    return None if name is None else str(name)
+
+
+def chosen(part: Features, wanted: str | None) -> tuple[Features, list[str]]:
+    """The objects of one world, by its path or its file's name, else of the first; and the other worlds.
+
+    NotFound tells the known ones.
+    """
+    known = names(part)
+    if wanted is not None and known:
+        found = [name for name in known if wanted in (name, PurePosixPath(name).name)]
+        if not found:
+            raise NotFound(f"there is no world {wanted[:200]!r}; there are: {', '.join(known)}")
+        known = [found[0], *(name for name in known if name != found[0])]
+    if len(known) < 2:
+        return part, []
+    others = frozenset(known[1:])
+    return part.take([k for k, p in enumerate(part.properties) if world_of(p) not in others]), known[1:]
