@@ -96,11 +96,13 @@ class Maps:
         """What was raw, derived, filled in and dropped: the contract's report, for this version."""
         told = self.make(recipe).report
         entries = {(e.key.layer, e.key.level, e.key.name): e.provenance for e in recipe.version.parts}
+        anew = {step.gives for step in recipe.steps}
         lines = []
         for line in told["layers"]:
-            # Equal content may have come from other files in another version: sources are this version's own.
+            # Equal content may have come from other files in another version: sources are this version's own. What a
+            # step on the way has made anew beside a stored part of that name came from the step's own sources.
             known = entries.get((line["layer"], line.get("level"), line["name"]))
-            if known is not None:
+            if known is not None and line["layer"] not in anew:
                 line = {  # noqa: PLW2901
                     **line,
                     "information": known.information,

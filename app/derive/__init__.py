@@ -93,7 +93,8 @@ class Step:
         """The step in the contract's words, with all its parameters."""
         defaults = {p["name"]: p["default"] for p in parameters.describe(all_derivations()[self.name].parameters)}
         values = {**defaults, **dict(self.given)}
-        return {"step": self.name, "from": list(self.needs), "to": self.gives, "parameters": values}
+        looked = {"also": list(self.also)} if self.also else {}
+        return {"step": self.name, "from": list(self.needs), **looked, "to": self.gives, "parameters": values}
 
 
 @dataclass(frozen=True, slots=True)

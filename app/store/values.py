@@ -195,6 +195,7 @@ class Version:
                     changed.append(f"{line['layer']} {line['level']}/{line['name']}")
             used = {(n["layer"], n["level"], n["name"]) for n in entry.provenance.inputs if "layer" in n}
             layers = {layer for layer, _, _ in used}
+            layers |= {layer for step in entry.provenance.steps for layer in step.get("also", ())}
             own = (entry.key.layer, entry.key.level, entry.key.name)
             new = [k for k in now if k[0] in layers and k not in used and k != own] if used else []
             changed += [f"{layer} {level}/{name}" for layer, level, name in new]

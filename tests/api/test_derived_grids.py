@@ -83,6 +83,25 @@ def test_a_fence_alone_gives_a_blank_grid_and_bounds_a_derived_one(api: Api) -> 
     assert sorted(line["sources"]) == ["datum.yaml", "map.osm"]
 
 
+def test_a_committed_grid_goes_stale_with_a_fence_that_comes_later(api: Api) -> None:
+    api.post("environments", {"name": "yard"})
+    api.upload("yard", {"map.osm": TOWN})
+    body = {"method": "objects_to_occupancy", "parameters": {"resolution": 0.1}}
+    made_ = api.post("environments/yard/derivations", body, expect=201).json()
+    assert made_["information"]["occupancy"] == "derived"
+    assert made_["stale"] == []
+    fence = b"""<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><Polygon><outerBoundaryIs><LinearRing>
+<coordinates>10,52 10.0001,52 10.0001,52.0001 10,52.0001 10,52</coordinates></LinearRing></outerBoundaryIs></Polygon>
+</Placemark></Document></kml>"""
+    head = api.upload("yard", {"fence.kml": fence}, layer="location").json()
+    assert [(s["layer"], s["changed"]) for s in head["stale"]] == [("occupancy", ["location ground/site"])]
+    _, said = made(api, "yard")
+    assert said["resolution"] == 0.1, "a map is made from what is there now, with the parameters of the stored one"
+    report = next(line for line in told(api, "yard")["layers"] if line["layer"] == "occupancy")
+    assert sorted(report["sources"]) == ["fence.kml", "map.osm"]
+    assert report["steps"][0]["also"] == ["location", "resources"]
+
+
 def test_a_drawing_of_regions_is_no_obstacle_and_says_so(api: Api) -> None:
     api.post("environments", {"name": "sketch"})
     square = [[0.001, 0], [0.002, 0], [0.002, 0.001], [0.001, 0]]
