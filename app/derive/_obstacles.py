@@ -34,6 +34,7 @@ from app.derive import Notes
 from app.errors import BadUpload, CannotConvert, Invalid, MissingDatum, NotFound, Problem
 from app.model import solids, worlds
 from app.model.features import Features, Properties
+from app.model.frame import MAX_METRES
 from app.model.layers import Layers
 
 Array = NDArray[np.float64]
@@ -64,6 +65,9 @@ The 0.1 m of a wall is what rmf_building_map_tools builds."""
 
 MOST_TRIANGLES = 10_000_000
 """Of all solids of a site together: a mesh of some megabytes can stand in a world many thousand times."""
+
+WIDEST = 1000.0
+"""Metres of a line's or a point's width: beyond it is a mistake."""
 
 LEVEL_HEIGHT = 3.0
 """Metres of a storey, where only the number of storeys is known (OpenStreetMap's simple 3D buildings)."""
@@ -238,7 +242,11 @@ class _Reader:
             p, geometry = part.properties[k], metres[n]
             if k in assembled:
                 geometry = self._local(part, assembled[k])
-            body = _body(geometry, p, width)
+            try:
+                body = _body(geometry, p, width)
+            except Invalid as error:
+                self.broken.append((part.ids[k], error.detail))
+                continue
             if body is None:
                 self.bodiless += 1
                 continue
@@ -247,7 +255,11 @@ class _Reader:
             site.base.append(base)
             site.top.append(top)
         for n, k in enumerate(free):
-            ground = _body(metres[len(rows) + n], part.properties[k], 0.0)
+            try:
+                ground = _body(metres[len(rows) + n], part.properties[k], 0.0)
+            except Invalid as error:
+                self.broken.append((part.ids[k], error.detail))
+                continue
             if ground is not None and ground.area > 0:
                 site.free.append(ground)
 
@@ -285,12 +297,14 @@ class _Reader:
             self.notes.drop(f"objects {kind}", count, IN_NO_WAY)
         for kind, count in sorted(self.shapeless.items()):
             self.notes.drop(
-                f"objects {kind}", count, "they say neither shapes nor a size: their files were not uploaded"
+                f"objects {kind}",
+                count,
+                "they say neither shapes nor a size: upload the files of their models with them",
             )
         self.notes.drop("objects", self.bodiless, "they have neither an area nor a size")
         for i, why in self.broken[:100]:
             self.notes.warn(f"left out: {why}", where=i)
-        self.notes.drop("objects with solids", len(self.broken), "their solids cannot be read")
+        self.notes.drop("objects", len(self.broken), "their solids cannot be read")
 
 
 def _tags(p: Properties) -> Mapping[str, Any]:
@@ -307,9 +321,9 @@ def _width(kind: str, p: Properties) -> float | None:
             return None
         values = OF_OSM[kind]
         width = values.get(str(tags[kind]), values.get("*", 0.0))
-        return (_metres(tags.get("width")) or _metres(tags.get("est_width")) or width) if width else None
-    said = p.get("width")
-    width = float(said) if isinstance(said, (int, float)) and not isinstance(said, bool) and said > 0 else 0.0
+        said = _metres(tags.get("width")) or _metres(tags.get("est_width")) or width
+        return min(said, WIDEST) if width else None
+    width = min(_positive(p.get("width")) or 0.0, WIDEST)
     if kind in OBSTACLES and not tags:
         return width or OBSTACLES[kind]
     if not tags and (_positive(p.get("height")) or _size(p)):
@@ -356,13 +370,13 @@ def _heights(p: Properties) -> tuple[float, float]:
     size = _size(p)
     if not top and size is not None and len(size) > 2 and size[2] > 0:
         pose = p.get("pose")
-        middle = pose[2] if isinstance(pose, (list, tuple)) and len(pose) > 2 and pose[2] else 0.0
-        top = (base or 0.0) + float(middle) + size[2]
+        bottom = _positive(pose[2]) if isinstance(pose, (list, tuple)) and len(pose) > 2 else None
+        top = (base or 0.0) + (bottom or 0.0) + size[2]
     return base or 0.0, top or math.inf
 
 
 def _positive(value: Any) -> float | None:
-    good = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value >= 0
+    good = isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value <= MAX_METRES
     return float(value) if good else None
 
 
@@ -395,8 +409,10 @@ def _relations(part: Features, rows: list[int]) -> dict[int, Any]:
         rings: dict[str, list[Any]] = {"outer": [], "inner": []}
         members = part.properties[k]["osm"].get("members")
         for member in members if isinstance(members, (list, tuple)) else ():
-            row = index.get(f"w{member[1]}") if len(member) > 2 and member[0] == "way" else None
-            role = "inner" if len(member) > 2 and member[2] == "inner" else "outer"
+            if not isinstance(member, (list, tuple)) or len(member) < 3:
+                continue
+            row = index.get(f"w{member[1]}") if member[0] == "way" else None
+            role = "inner" if member[2] == "inner" else "outer"
             if row is not None:
                 geometry = part.geometry[row]
                 rings[role].append(shapely.boundary(geometry) if shapely.get_type_id(geometry) == 3 else geometry)

@@ -9,17 +9,23 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from app import bundle, derive, parameters
 from app.bundle import Hints, Known
 from app.derive import Notes
+from app.derive._obstacles import OF_OSM
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
+from app.derive.objects_to_voxels import Parameters as VoxelParameters
+from app.derive.objects_to_voxels import objects_to_voxels
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer
 from app.formats import Limits
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, SITE, Layers, Part, PartKey, Resources
+from app.model.solids import TYPES
 from tests.model.test_meshes import stl
 
 BOX = {"type": "box", "size": [1, 2, 3], "pose": [0, 0, 1.5, 0, 0, 0]}
@@ -295,7 +301,7 @@ def test_what_cannot_be_read_is_left_out_and_told() -> None:
     assert at(g, 0, 0) == 100
     assert 100 in (at(g, 6.5, 6.02), at(g, 6.5, 5.98)), "an open triangle is still a surface"
     assert [(w.where, "bad.stl" in w.problem) for w in notes.warnings] == [("o1", True)]
-    assert notes.dropped == [{"what": "objects with solids", "count": 1, "why": "their solids cannot be read"}]
+    assert notes.dropped == [{"what": "objects", "count": 1, "why": "their solids cannot be read"}]
 
 
 def test_bodies_without_files_are_told_apart_from_marks() -> None:
@@ -308,7 +314,7 @@ def test_bodies_without_files_are_told_apart_from_marks() -> None:
     grid(layers(objects(*rows)), notes)
     assert {d["what"]: d["why"] for d in notes.dropped} == {
         "objects light": "nothing in a robot's way",
-        "objects include": "they say neither shapes nor a size: their files were not uploaded",
+        "objects include": "they say neither shapes nor a size: upload the files of their models with them",
     }
 
 
@@ -317,7 +323,7 @@ def test_what_keeps_a_world_from_being_a_grid_is_told() -> None:
         (shapely.Point(0, 0), {"kind": "include"}),
         (None, {"kind": "model", "shapes": [{"type": "mesh", "file": "a.dae"}]}),
     ]
-    with pytest.raises(MissingLayer, match=r"1 objects include: .*; 1 objects with solids: "):
+    with pytest.raises(MissingLayer, match=r"1 objects include: .*; 1 objects: their solids"):
         grid(layers(objects(*rows)))
 
 
@@ -344,6 +350,66 @@ def test_objects_beyond_the_local_frame_are_a_clear_problem() -> None:
 def test_visuals_count_only_where_asked() -> None:
     content = layers(objects((None, {"kind": "model", "shapes": [{**BOX, "visual": True}]})))
     assert occupied(grid(content, visuals=True)) == pytest.approx(2)
+
+
+NUMBERS = st.one_of(
+    st.floats(-1e12, 1e12), st.integers(-(10**30), 10**30), st.booleans(), st.text(max_size=3), st.none()
+)
+LISTS = st.one_of(NUMBERS, st.lists(NUMBERS, max_size=7), st.lists(st.lists(NUMBERS, max_size=3), max_size=3))
+SHAPE = st.fixed_dictionaries(
+    {"type": st.sampled_from([*sorted(TYPES), "cone"])},
+    optional=dict.fromkeys(("size", "radius", "radii", "length", "pose", "normal", "points", "height", "scale"), LISTS)
+    | {"file": st.sampled_from(["a.stl", "", None]), "submesh": NUMBERS, "visual": NUMBERS},
+)
+TAGS = st.dictionaries(
+    st.sampled_from([*OF_OSM, "height", "width", "min_height", "building:levels", "tunnel", "layer"]),
+    st.one_of(
+        st.text(max_size=4), st.sampled_from(["yes", "tree", "1e400", "9" * 39, "5 m", "fence", "water"]), NUMBERS
+    ),
+    max_size=4,
+)
+OWN = st.fixed_dictionaries({}, optional={"tags": st.one_of(TAGS, NUMBERS), "members": LISTS})
+SAID = st.fixed_dictionaries(
+    {
+        "kind": st.sampled_from(
+            ["model", "wall", "building", "natural", "floor", "lift", "hole", "door", "crate", 7, None]
+        )
+    },
+    optional={
+        **dict.fromkeys(("size", "pose", "height", "base", "width"), LISTS),
+        "shapes": st.one_of(st.lists(SHAPE, max_size=2), NUMBERS),
+        "osm": st.one_of(OWN, NUMBERS),
+    },
+)
+PLACES = st.sampled_from(
+    [
+        None,
+        shapely.Point(1, 2),
+        shapely.Point(1, 2, 3),
+        shapely.LineString([(0, 0), (0, 0)]),
+        shapely.LineString([(0, 0, 1), (5, 5, 1)]),
+        shapely.Polygon([(0, 0), (2, 2), (2, 0), (0, 2)]),
+        shapely.MultiPoint([(0, 0), (9, 9)]),
+        shapely.GeometryCollection([shapely.Point(0, 0), shapely.box(1, 1, 2, 2)]),
+    ]
+)
+
+
+@given(st.lists(st.tuples(PLACES, SAID), min_size=1, max_size=3))
+@settings(max_examples=300, deadline=None)
+def test_whatever_objects_say_is_a_grid_or_a_clear_problem(rows: list[Any]) -> None:
+    """What is wrong with one object is told, and the others are there all the same."""
+    content = layers(objects(*rows, (shapely.box(0, 0, 1, 1), {"kind": "building"})), files={"a.stl": stl()})
+    try:
+        made = grid(content, resolution=0.5, doors="closed")
+    except CannotConvert as error:
+        assert "resolution of at least" in error.detail, "what lies far away makes it large"
+    else:
+        assert at(made, 0.5, 0.5) == 100
+    try:
+        objects_to_voxels(content, VoxelParameters(resolution=0.5), Notes())
+    except CannotConvert as error:
+        assert "coarser resolution" in error.detail or "resolution of at least" in error.detail
 
 
 def test_parameters_are_checked() -> None:
