@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from app import formats
 from app.errors import BadUpload, Invalid, Problem, UnreadableFile
-from app.formats import Files, Format, Group, Limits, ReadContext, _archive, _shell
+from app.formats import Files, Format, Group, Limits, ReadContext, _archive, _json, _shell, _xml, _yaml
 from app.model import network
 from app.model.features import Features, concatenate, from_columns, unique_ids
 from app.model.frame import GROUND, Datum, Level
@@ -42,6 +42,8 @@ _QUIET = re.compile(r"(^|/)(\.|license|licence|copying|readme|notice|authors|cha
 _LICENCE = re.compile(r"(licen[cs]e|copying|notice|attribution|copyright)([-.].*)?", re.IGNORECASE)
 _COPYRIGHT = re.compile(r"(copyright|©|\(c\)).*\d{4}", re.IGNORECASE)
 _NOTICE_BYTES, _NOTICE_LINE = 2**14, 160
+_JSON_ENDS, _YAML_ENDS = (".json", ".geojson"), (".yaml", ".yml")
+_XML_ENDS = (".xml", ".osm", ".kml", ".sdf", ".world", ".gpx")
 _FENCE = re.compile(r"fence|boundary|perimeter", re.IGNORECASE)
 
 SAME_PLACE_DEGREES = 1e-7
@@ -196,9 +198,32 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
         known_formats = ", ".join(f.name for f in formats.all_formats().values() if f.read)
         detail = f"none of the files is a map that is known here; name the format, one of: {known_formats}"
         detail += "".join(f"; {name}: {text}" for name, text in list(lacks.items())[:1])
-        raise UnreadableFile(detail, [Problem(lacks.get(n, "no known map format"), n) for n in sorted(files)])
+        problems = [Problem(lacks[n], n) if n in lacks else _unknown(n, files[n], limits) for n in sorted(files)]
+        broken = next((p for p in problems if p.line is not None), None)
+        detail += f"; {broken.file}, line {broken.line}: {broken.problem}" if broken else ""
+        raise UnreadableFile(detail, problems)
     _choose_datum(bundle, known)
     return bundle
+
+
+def _unknown(name: str, data: bytes, limits: Limits) -> Problem:
+    """Why nobody knows a file: where its name or first bytes tell a syntax in which it does not parse, the line."""
+    end = PurePosixPath(name).suffix.lower()
+    first = data.lstrip(b"\xef\xbb\xbf \t\r\n")[:1]
+    try:
+        if end in _JSON_ENDS or (first and first in b"{[" and end not in _YAML_ENDS):
+            _json.load(data, limits)
+        elif end in _YAML_ENDS:
+            _yaml.load(data, limits)
+        elif end in _XML_ENDS or first == b"<":
+            _xml.parse(data, limits)
+    except BadUpload as error:
+        told = next(iter(error.problems), Problem(error.detail))
+        return dataclasses.replace(told, file=name)
+    except formats.BAD_INPUT as error:
+        line, reason = formats.explain(error)
+        return Problem(f"it cannot be parsed: {reason}", name, line)
+    return Problem("no known map format", name)
 
 
 def template_folder(name: str) -> tuple[str, ...] | None:

@@ -242,3 +242,25 @@ def test_real_template_folders(shared: Path, facts_json: dict[str, Any], environ
         if known["kind"] == "occupancy_map_yaml" and "metric/map/" in name:
             grid = bundle.parts[PartKey("occupancy", "ground", "map")]
             assert grid.counts()["occupied"] == known["facts"]["cells"]["occupied_100"]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "line"),
+    [
+        ("map.yaml", b"image: a.pgm\nresolution: [0.05\norigin: 3\n", 3),
+        ("graph.geojson", b'{"features": [\n1,,2]}', 2),
+        ("data", b'{"a":\n\n]', 3),
+        ("world.sdf", b"<sdf>\n<world>\n</sdf>", 3),
+        ("drawing", b"<a>\n<b></a>", 2),
+        ("entities.xml", b"<!DOCTYPE a [<!ENTITY b 'c'>]>\n<a/>", 1),
+        ("fine.json", b'{"a": 1}', None),
+        ("notes.txt", b"{ not JSON, and not called so either", 1),
+    ],
+)
+def test_what_nobody_knows_and_does_not_parse_is_told_with_its_line(name: str, data: bytes, line: int | None) -> None:
+    with pytest.raises(UnreadableFile) as caught:
+        read({name: data}, Hints(), Known(), LIMITS)
+    (problem,) = caught.value.problems
+    assert (problem.file, problem.line) == (name, line)
+    assert (problem.problem == "no known map format") == (line is None)
+    assert (f"line {line}" in caught.value.detail) == (line is not None)

@@ -60,6 +60,18 @@ def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) ->
     return None
 
 
+def lacking(database_url: str, blob_dir: str, version: Version, name: str, way: Chain) -> tuple[str, str] | None:
+    """In a worker: what a format wants of its layers besides that they are there, and they do not have, or None."""
+    known = formats.get_format(name)
+    loaded = open_store(database_url, blob_dir).load(version, way.keys)
+    try:
+        made = derive.run(way.steps, Layers(loaded.parts, version.datum, version.levels))
+    except FleetMapError as error:
+        return "", error.detail
+    reason = known.lacks(made) if known.lacks is not None else None
+    return None if reason is None else ("", f"{name}: {reason}")
+
+
 def write(
     known: Format,
     layers: Layers,

@@ -164,12 +164,31 @@ class Maps:
                 raise MissingLayer(error.detail, [Problem(reason) for reason in failed]) from error
             hindrance = self._hindrance(version, way) if way.steps else None
             if hindrance is None:
+                self._check_content(version, known, way)
                 return way
             step, reason = hindrance
             failed.append(reason)
             if not step:
                 raise CannotConvert(reason, [Problem(reason) for reason in failed])
             without |= {step}
+
+    def _check_content(self, version: Version, known: formats.Format, way: recipes.Chain) -> None:
+        """CannotConvert where the layers are there and hold too little for the format (a network without edges)."""
+        if known.lacks is None:
+            return
+        entries = {e.key: e.hash for e in version.parts}
+        key = (known.name, way.steps, version.datum, tuple((k, entries[k]) for k in way.keys))
+        with self._guard:
+            tried, found = key in self._tried, self._tried.get(key)
+        if not tried:
+            where = (self._store.database_url, str(self._store.blob_dir))
+            try:
+                found = self._run(making.lacking, *where, version, known.name, way)
+            except WorkerDied as error:
+                found = ("", error.detail)
+            self._remember(key, found)
+        if found is not None:
+            raise CannotConvert(found[1], [Problem(found[1])])
 
     def _hindrance(self, version: Version, way: recipes.Chain) -> tuple[str, str] | None:
         """The step of a chain that would not work on what is stored and why (no step: none is to blame)."""

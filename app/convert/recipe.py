@@ -28,9 +28,9 @@ SUPPLY: Mapping[Layer, str] = {
     "topology": "a network: upload a tmap2 or OSM file, or a drawing (KML, GeoJSON) with layer=topology",
     "occupancy": "an occupancy grid: upload a map.yaml with its image",
     "voxels": "a voxel map: upload an OctoMap file or a point cloud (pcd, ply, las)",
-    "imagery": "a georeferenced picture",
+    "imagery": "a georeferenced picture: upload a GeoTIFF, or a PNG with its world file",
     "zones": "zones: upload a drawing with layer=zones",
-    "resources": "the files that belong to the objects",
+    "resources": "the files that belong to the objects: upload them together with the objects' file",
 }
 """What a user can do about a missing layer."""
 

@@ -123,7 +123,7 @@ class WriteContext:
     def drop(self, what: str, count: int, why: str) -> None:
         """This much of the stored information has no place in the format."""
         if count:
-            self.dropped.append({"what": what, "count": count, "why": why})
+            self.dropped.append({"what": what, "count": int(count), "why": why})  # also of NumPy's integers
 
     def fill(self, what: str, value: Any, why: str) -> None:
         """The format asks for this and no layer has it: a default was filled in."""
@@ -169,7 +169,8 @@ class Format:
     carries, those that these options ask for. by_file: the options that a wanted file's name says. outlines: it writes
     where grids lie, not their cells. joined: its main files of one folder are one map (graphs 0.yaml, 1.yaml …).
     check: the loader rules of the map's consumers, looked at in a map's files (main file first) without our reader
-    or writer; ``app.formats.check`` says what it gives and what it may cost.
+    or writer; ``app.formats.check`` says what it gives and what it may cost. lacks: what such layers must hold besides
+    being there (an edge), and do not: what to supply, or None.
     yields: a main file of this name only speaks for others (a world file for its picture), so it is none where one of
     those is a main file itself. lacking: what a file needs that may be such a map but does not say enough by itself (a
     picture without a place); empty for other files. completing: the read options that say it.
@@ -203,6 +204,7 @@ class Format:
     sort: Callable[[Files, Sequence[str]], Mapping[str, Iterable[str]]] | None = None
     holds: bool = False
     check: Callable[[Files], Iterable[Problem]] | None = None
+    lacks: Callable[[Layers], str | None] | None = None
     yields: Callable[[str], bool] = lambda name: False
     lacking: Callable[[str, bytes], str] = lambda name, data: ""
     completing: frozenset[str] = frozenset()
@@ -372,7 +374,7 @@ def read(item: Group, context: ReadContext) -> Layers:
             f"{item.main} needs more memory than an upload may use", [Problem("out of memory", item.main)]
         ) from error
     except BAD_INPUT as error:
-        line, reason = _explain(error)
+        line, reason = explain(error)
         detail = f"{item.main} cannot be read as {known.title}: {reason}"
         raise UnreadableFile(detail, [Problem(reason, item.main, line)]) from error
     count = sum(len(p) for p in layers.parts.values() if isinstance(p, Features))
@@ -443,7 +445,7 @@ def _findings(known: Format, files: Files, main: str) -> Iterator[Problem]:
     except FleetMapError as error:
         yield from [replace(p, level="error") for p in error.problems] or [Problem(error.detail, main, level="error")]
     except BAD_INPUT as error:
-        line, reason = _explain(error)
+        line, reason = explain(error)
         yield Problem(f"it cannot be read as {known.title}: {reason}", main, line, level="error")
 
 
@@ -492,7 +494,7 @@ def _said(error: FleetMapError, item: Group) -> Problem:
     return Problem(error.detail, item.main)
 
 
-def _explain(error: BaseException) -> tuple[int | None, str]:
+def explain(error: BaseException) -> tuple[int | None, str]:
     """Line (from 1, where the parser told one) and a reason that a user understands."""
     if isinstance(error, yaml.MarkedYAMLError):
         mark = error.problem_mark or error.context_mark

@@ -113,12 +113,6 @@ def short(text: str, most: int = LONGEST) -> str:
     return f"{text[: most - 18]}~{hashlib.blake2b(text.encode(), digest_size=8).hexdigest()}"
 
 
-def own(p: Properties, family: str) -> dict[str, Any]:
-    """What only this family knows of an item."""
-    said = p.get(family)
-    return said if isinstance(said, dict) else {}
-
-
 def limit(p: Properties) -> float:
     """An edge's speed limit in metres per second; 0 where there is none."""
     said = p.get("speed_limit")

@@ -685,7 +685,7 @@ class _Writer:
         self.filled["edges"] += plain
         self.dropped["items that are neither a node nor an edge from a node"] += lost
         self.dropped["nodes without a point"] += kinds.count("node") - len(said)
-        bent = (shapely.get_num_coordinates(part.geometry) > 2) & [kind == "edge" for kind in kinds]
+        bent = (shapely.get_num_coordinates(part.geometry) > 2) & np.array([kind == "edge" for kind in kinds], bool)
         self.dropped["edges' bends between their nodes"] += int(bent.sum())
         return edges
 

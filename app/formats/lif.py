@@ -689,6 +689,12 @@ def _metres(value: float) -> float:
 # --- the format ------------------------------------------------------------------------------------------------------
 
 
+def lacks(layers: Layers) -> str | None:
+    """A layout needs a node."""
+    some_node = any(p.get("kind") == "node" for part in layers.vector("topology").values() for p in part.properties)
+    return None if some_node else "the network has no node: supply one with nodes"
+
+
 def detect(name: str, data: bytes) -> bool:  # noqa: ARG001 - one signature for all formats
     """A JSON object with LIF's two members on top."""
     if data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")[:1] != b"{" or b'"metaInformation"' not in data:
@@ -719,6 +725,7 @@ register(
         detect=detect,
         read=read,
         check=_lif_rules.check,
+        lacks=lacks,
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=WriteOptions,

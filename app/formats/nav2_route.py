@@ -515,6 +515,12 @@ def _candidates(text: str, size: int) -> Iterable[int]:
 # --- the format ------------------------------------------------------------------------------------------------------
 
 
+def lacks(layers: Layers) -> str | None:
+    """Nodes and edges must both be there."""
+    kinds = {p.get("kind") for part in layers.vector("topology").values() for p in part.properties}
+    return None if {"node", "edge"} <= kinds else "the network has no edge between its nodes: supply one with edges"
+
+
 def detect(name: str, data: bytes) -> bool:  # noqa: ARG001 - one signature for all formats
     """A JSON object of features with the route server's own words."""
     if data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")[:1] != b"{":
@@ -535,6 +541,7 @@ register(
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
         family=NAME,
         check=_nav2_route_rules.check,
+        lacks=lacks,
         rank=36,
         extensions=(".geojson", ".json"),
     )

@@ -40,7 +40,8 @@ from numpy.typing import NDArray
 
 from app.errors import MissingLayer
 from app.formats import Files, Format, Needs, ReadContext, WriteContext, _openrmf_rules, _rmf, _yaml, register
-from app.formats._rmf import BUILDING, NAV_GRAPH, Array, Flow, index, listing, mapping, number, own, refuse, value_of
+from app.formats._network import own
+from app.formats._rmf import BUILDING, NAV_GRAPH, Array, Flow, index, listing, mapping, number, refuse, value_of
 from app.formats._text import DEGREES, METRES, numbers
 from app.model.features import Features, Properties, features, from_columns, points, segments, unique_ids
 from app.model.frame import GROUND, Level

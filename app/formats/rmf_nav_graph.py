@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from app.errors import MissingLayer
 from app.formats import Files, Format, Needs, ReadContext, WriteContext, _rmf, _rmf_nav_graph_rules, _yaml, register
+from app.formats._network import own
 from app.formats._rmf import (
     BUILDING,
     CABIN_HEIGHT,
@@ -41,7 +42,6 @@ from app.formats._rmf import (
     listing,
     mapping,
     number,
-    own,
     refuse,
     value_of,
 )
@@ -703,6 +703,12 @@ _OF_BUILDING = re.compile(
 )
 
 
+def lacks(layers: Layers) -> str | None:
+    """A graph needs a lane."""
+    some_edge = any(p.get("kind") == "edge" for part in layers.vector("topology").values() for p in part.properties)
+    return None if some_edge else "the network has no edge: supply one with edges (building.yaml, tmap2, OSM …)"
+
+
 def detect(name: str, data: bytes) -> bool:
     """YAML with a building's name and levels, and nothing that only a building.yaml has."""
     if not name.lower().endswith((".yaml", ".yml")) or not _TOP.search(data):
@@ -725,6 +731,7 @@ register(
         detect=detect,
         read=read,
         check=_rmf_nav_graph_rules.check,
+        lacks=lacks,
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"objects"})),
         family=NAME,

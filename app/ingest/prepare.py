@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from app import bundle, formats
 from app.bundle import Bundle, Hints, Known
@@ -76,6 +77,7 @@ def prepare_upload(
     ]
     operations += _stale_clouds(base, told)
     warnings = [*told.warnings, *_idle(hints, told)]
+    warnings += far_away(told, told.datum or base.datum)
     datum: Any = KEEP
     if told.datum is not None and told.datum != base.datum:
         datum = told.datum
@@ -116,6 +118,45 @@ def _idle(hints: Hints, told: Bundle) -> list[Problem]:
 def prepare_changes(database_url: str, blob_dir: str, base: Version, changes: Changes) -> Prepared:
     """In a worker: what these changes would make of a version."""
     return open_store(database_url, blob_dir).prepare(base, changes)
+
+
+FAR_METRES = 100_000.0
+"""From the datum. The local frame is exact to a millimetre in 10 km; what lies so far away is most often a mistake."""
+_EARTH_RADIUS = 6_371_000.0
+
+
+def far_away(told: Bundle, datum: Datum | None) -> list[Problem]:
+    """Parts whose nearest corner is far from the datum: swapped coordinates, or the wrong environment."""
+    out = []
+    for key, part in sorted(told.parts.items()):
+        if not isinstance(part, Features) or not len(part):
+            continue
+        metres = []
+        if part.local.any():
+            west, south, east, north = shapely.total_bounds(part.geometry[part.local])
+            metres.append(float(np.hypot(max(west, 0.0, -east), max(south, 0.0, -north))))
+        if datum is not None and not part.local.all():
+            metres.append(_metres_to(shapely.total_bounds(part.geometry[~part.local]), datum))
+        known = [m for m in metres if np.isfinite(m)]
+        if known and min(known) > FAR_METRES:
+            where = f"{key.layer} {key.level}/{key.name}"
+            reason = (
+                f"lies about {min(known) / 1000:.0f} km from the datum: is it the right environment, and are no "
+                "coordinates swapped?"
+            )
+            files, _ = told.origin.get(key, ((), ""))
+            out.append(Problem(reason, files[0] if files else None, where=where))
+    return out
+
+
+def _metres_to(box: NDArray[np.float64], datum: Datum) -> float:
+    """From a datum to the nearest point of a box in degrees [west, south, east, north], about, on a sphere."""
+    west, south, east, north = box
+    here, lat = np.radians(datum.latitude), np.radians(np.clip(datum.latitude, south, north))
+    turn = min(abs((datum.longitude - edge + 180.0) % 360.0 - 180.0) for edge in (west, east))
+    turn = 0.0 if west <= datum.longitude <= east else turn
+    half = np.sin((lat - here) / 2) ** 2 + np.cos(here) * np.cos(lat) * np.sin(np.radians(turn) / 2) ** 2
+    return float(2 * _EARTH_RADIUS * np.arcsin(np.sqrt(np.clip(half, 0.0, 1.0))))
 
 
 def moved(base: Version, datum: Datum) -> list[Problem]:

@@ -273,3 +273,18 @@ def test_what_was_said_in_vain_is_told(api: Api, bare: str) -> None:
     assert {w["where"] for w in body["warnings"]} == {"layer", "grid"}
     assert api.upload(bare, samples.grid(), grid="keepout").json()["warnings"] == []
     assert not [w for w in api.upload(bare, {"d.kml": samples.KML}, layer="zones").json()["warnings"] if "where" in w]
+
+
+FAR_KML = """<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>a</name>
+<Point><coordinates>{},{}</coordinates></Point></Placemark></Document></kml>"""
+
+
+@pytest.mark.parametrize(("lon", "lat", "far"), [(-0.5, 53.2, False), (0.6, 53.2, False), (53.2, -0.5, True)])
+def test_what_lies_far_from_the_datum_is_doubted(api: Api, lon: float, lat: float, far: bool) -> None:
+    env = f"far-{abs(int(lon * 10))}"
+    api.post("environments", {"name": env, "datum": {"latitude": 53.2, "longitude": -0.5}})
+    made = api.upload(env, {"a.kml": FAR_KML.format(lon, lat).encode()}).json()
+    told = [w["problem"] for w in made["warnings"] if "km from the datum" in w["problem"]]
+    assert bool(told) == far
+    if far:
+        assert "7746 km" in told[0], "by the spherical law of cosines, worked out apart"

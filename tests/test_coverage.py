@@ -1,0 +1,85 @@
+"""The coverage table keeps its word: what it calls direct or derivable is served, what is missing can be supplied.
+
+Over every format that is registered, so a new one is tested here by itself.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app import formats
+from tests.api.conftest import Api, running, settings_for
+from tests.formats.test_every_format import cases
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "environment_template"
+SUPPLY = re.compile(r"upload|supply|PATCH|needs|ask for|option", re.IGNORECASE)
+JOB_SECONDS = 300.0
+
+
+def environments() -> list[Any]:
+    """Every environment_template folder, and the first sample of each kind."""
+    out: list[Any] = []
+    for root in sorted(p for p in SHARED.iterdir() if p.is_dir()) if SHARED.is_dir() else []:
+        files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+        out.append(pytest.param(files, None, id=root.name))
+    seen = set()
+    for name, case, files in cases():
+        if name not in seen:
+            seen.add(name)
+            out.append(pytest.param(files, name, id=case))
+    return out
+
+
+@pytest.fixture(scope="module")
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
+    with running(settings_for(tmp_path_factory.mktemp("server"))) as server:
+        yield server
+
+
+def finished(api: Api, job: dict[str, Any]) -> dict[str, Any]:
+    """A job's end."""
+    until = time.monotonic() + JOB_SECONDS
+    while job["state"] in ("queued", "running") and time.monotonic() < until:
+        time.sleep(0.5)
+        job = api.get(f"jobs/{job['id']}").json()
+    return job
+
+
+@pytest.mark.parametrize(("files", "kind"), environments())
+def test_the_table_keeps_its_word(
+    api: Api, files: dict[str, bytes], kind: str | None, request: pytest.FixtureRequest
+) -> None:
+    env = re.sub(r"[^a-z0-9]+", "-", request.node.callspec.id.lower()).strip("-")[:60]
+    api.post("environments", {"name": env})
+    api.upload(env, files, **({"format": kind} if kind else {}))
+    rows = api.get(f"environments/{env}/versions/latest/maps").json()
+    assert {row["format"] for row in rows} == {f.name for f in formats.all_formats().values() if f.write}
+    states = {row["format"]: row["state"] for row in rows}
+    if kind is not None and kind in states:
+        assert states[kind] == "direct", "a map is to be had as it came"
+    for row in rows:
+        what = f"{env} as {row['format']}"
+        if row["state"] == "missing":
+            assert row["missing"], f"{what}: what is to be supplied?"
+            assert all(SUPPLY.search(text) for text in row["missing"]), f"{what}: {row['missing']}"
+            refused = api.get(f"environments/{env}/versions/latest/maps/{row['format']}", None)
+            assert 400 <= refused.status_code < 500, f"{what}: {refused.status_code}"
+            continue
+        assert row["state"] in ("direct", "derivable"), what
+        assert bool(row["chain"]) == (row["state"] == "derivable"), what
+        answer = api.get(f"environments/{env}/versions/latest/maps/{row['format']}", None)
+        if row.get("choose"):
+            assert answer.status_code == 409, f"{what}: {answer.status_code}"
+            continue
+        assert answer.status_code in (200, 202), f"{what}: {answer.status_code} {answer.text[:500]}"
+        if answer.status_code == 202:
+            job = finished(api, answer.json())
+            assert job["state"] == "done", f"{what}: {job}"
+        else:
+            assert answer.content, what
