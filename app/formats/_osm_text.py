@@ -7,7 +7,7 @@ to be none, and what XML cannot say becomes the replacement character.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +15,9 @@ from app.formats._osm import INT64
 from app.formats._text import DEGREES, numbers
 
 NOTHING: Mapping[str, str] = {}
+
+LINES = 10_000
+"""That are turned into bytes at once."""
 
 Way = tuple[Sequence[int], Mapping[str, str], Mapping[str, str]]
 """The ids of its nodes, tags, attributes."""
@@ -36,8 +39,26 @@ class Node:
 
 def document(
     head: Iterable[str], nodes: Mapping[int, Node], ways: Mapping[int, Way], relations: Mapping[int, Relation]
-) -> str:
-    """The file: the lines of ``head`` (the root element first), then nodes, ways and relations, each by id."""
+) -> bytes:
+    """The file: the lines of ``head`` (the root element first), then nodes, ways and relations, each by id.
+
+    Lines become bytes a few at a time: as texts all of them would take four times the memory.
+    """
+    done = bytearray()
+    lines: list[str] = []
+    for line in _lines(head, nodes, ways, relations):
+        lines.append(line)
+        if len(lines) == LINES:
+            lines.append("")
+            done += "\n".join(lines).encode()
+            lines.clear()
+    done += "\n".join([*lines, ""]).encode()
+    return bytes(done)
+
+
+def _lines(
+    head: Iterable[str], nodes: Mapping[int, Node], ways: Mapping[int, Way], relations: Mapping[int, Relation]
+) -> Iterator[str]:
     cache: dict[int, str] = {}
 
     def attributes(said: Mapping[str, str]) -> str:
@@ -49,7 +70,8 @@ def document(
             known = cache[id(said)] = attribute_text(said, RESERVED)
         return known
 
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', *head]
+    yield '<?xml version="1.0" encoding="UTF-8"?>'
+    yield from head
     order = sorted(nodes, key=rank)
     lon = degrees([nodes[i].lon for i in order])
     lat = degrees([nodes[i].lat for i in order])
@@ -57,31 +79,30 @@ def document(
         node = nodes[i]
         place = f' lat="{y}" lon="{x}"' if x is not None else ""
         if node.tags:
-            lines.append(f' <node id="{i}"{attributes(node.attributes)}{place}>')
-            lines += tag_lines(node.tags)
-            lines.append(" </node>")
+            yield f' <node id="{i}"{attributes(node.attributes)}{place}>'
+            yield from tag_lines(node.tags)
+            yield " </node>"
         else:
-            lines.append(f' <node id="{i}"{attributes(node.attributes)}{place}/>')
+            yield f' <node id="{i}"{attributes(node.attributes)}{place}/>'
     for i in sorted(ways, key=rank):
         refs, tags, said = ways[i]
         if not refs and not tags:
-            lines.append(f' <way id="{i}"{attributes(said)}/>')
+            yield f' <way id="{i}"{attributes(said)}/>'
             continue
-        lines.append(f' <way id="{i}"{attributes(said)}>')
-        lines += [f'  <nd ref="{r}"/>' for r in refs]
-        lines += tag_lines(tags)
-        lines.append(" </way>")
+        yield f' <way id="{i}"{attributes(said)}>'
+        yield from [f'  <nd ref="{r}"/>' for r in refs]
+        yield from tag_lines(tags)
+        yield " </way>"
     for i in sorted(relations, key=rank):
         members, tags, said = relations[i]
         if not members and not tags:
-            lines.append(f' <relation id="{i}"{attributes(said)}/>')
+            yield f' <relation id="{i}"{attributes(said)}/>'
             continue
-        lines.append(f' <relation id="{i}"{attributes(said)}>')
-        lines += [f'  <member type="{escape(t)}" ref="{r}" role="{escape(role)}"/>' for t, r, role in members]
-        lines += tag_lines(tags)
-        lines.append(" </relation>")
-    lines.append("</osm>\n")
-    return "\n".join(lines)
+        yield f' <relation id="{i}"{attributes(said)}>'
+        yield from [f'  <member type="{escape(t)}" ref="{r}" role="{escape(role)}"/>' for t, r, role in members]
+        yield from tag_lines(tags)
+        yield " </relation>"
+    yield "</osm>"
 
 
 def further_elements(rows: Any) -> list[str]:

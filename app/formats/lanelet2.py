@@ -458,6 +458,7 @@ class _Reader:
             if times:
                 context.warn(f"{times} {text}")
         self.xyz = xyz
+        self.known: dict[int, dict[str, Any]] = {}
         self.located = {i: k for i, k in row.items() if not lost[k]}
 
     def network(self) -> Features:
@@ -496,7 +497,7 @@ class _Reader:
         properties: list[Properties] = []
         for k in lone:
             tags = data.tags.get(k, {})
-            said = self.bend(k)
+            said = self.asked(k)
             if children := data.node_children.get(k):
                 said["children"] = [list(c) for c in children]
             properties.append(_properties(said, tags, "point"))
@@ -551,7 +552,13 @@ class _Reader:
         return said
 
     def bend(self, k: int) -> dict[str, Any]:
-        """What is known of a point beside its place."""
+        """What is known of a point beside its place; one value for all ways that bend there."""
+        known = self.known.get(k)
+        if known is None:
+            known = self.known[k] = self.asked(k)
+        return known
+
+    def asked(self, k: int) -> dict[str, Any]:
         said: dict[str, Any] = {}
         tags = self.data.tags.get(k)
         if tags:
@@ -625,7 +632,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     for level in dict.fromkeys(key.level for key in sorted(layers.parts)):
         out.level(level)
     out.add_network()
-    files = {MAIN: out.text().encode()}
+    files = {MAIN: out.text()}
     if out.projector is not None:
         files[PROJECTOR] = out.projector.encode()
     elif context.options.projector_info:
@@ -686,14 +693,20 @@ class _Writer:
         for what, i, shape, said in rows:
             if what == "n":
                 self.point(level, i, shape, said, local, nodes if networks else None)
-        for what, i, shape, said in rows:
-            if what == "w":
-                self.way(level, i, shape, said, local)
+        drawn_anew = [
+            (i, shape, said)
+            for what, i, shape, said in rows
+            if what == "w" and not self.way(level, i, shape, said, local)
+        ]
+        for i, shape, said in drawn_anew:  # once the points of all others are there to be met
+            refs = integers(said.get("refs")) or []
+            points = self.redrawn(level, refs, _course(shape), local)
+            self.ways[level.ways[i]] = (points, as_texts(said.get("tags")), as_texts(said.get("attributes")))
         relations = [(i, said) for what, i, _, said in rows if what == "r"]
         for i, _ in relations:
             level.relations[i] = self.fresh() if i in self.relations else i
             self.relations[level.relations[i]] = ([], NOTHING, NOTHING)
-        said_of = self.lanelets(part, geometry, local, relations, networks)
+        said_of = self.lanelets(level, part, local, relations, networks)
         for i, said in relations:
             self.relation(level, i, said, said_of.get(i, (NOTHING, False)))
 
@@ -709,7 +722,8 @@ class _Writer:
         level.nodes[i] = new
         self.children(said)
 
-    def way(self, level: _Level, i: int, shape: Any, said: Mapping[str, Any], local: bool) -> None:
+    def way(self, level: _Level, i: int, shape: Any, said: Mapping[str, Any], local: bool) -> bool:
+        """Write a way; False where its geometry no longer has the points that it came with."""
         refs = integers(said.get("refs"))
         at = _course(shape)
         new = level.ways[i] = self.fresh() if i in self.ways else i
@@ -717,8 +731,8 @@ class _Writer:
         tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
         missing = set(integers(said.get("missing")) or ())
         if refs is None or len(refs) - len(missing) != len(at):
-            self.ways[new] = (self.redrawn(level, refs or [], at, local), tags, attributes)
-            return
+            self.ways[new] = ([], tags, attributes)
+            return False
         bends = said.get("vertices")
         rows = bends if isinstance(bends, list) and len(bends) == len(refs) else [bends] * len(refs)
         out, j = [], 0
@@ -742,6 +756,7 @@ class _Writer:
                 j += 1
             out.append(name)
         self.ways[new] = (out, tags, attributes)
+        return True
 
     def redrawn(self, level: _Level, refs: list[int], at: list[tuple[float, float, float]], local: bool) -> list[int]:
         """Points for a way whose geometry was edited: its own where one stands at a bend, else new ones."""
@@ -761,8 +776,8 @@ class _Writer:
 
     def lanelets(
         self,
+        level: _Level,
         part: Features,
-        geometry: Any,
         local: bool,
         relations: Sequence[tuple[int, Mapping[str, Any]]],
         networks: Mapping[PartKey, Features],
@@ -776,36 +791,41 @@ class _Writer:
         xyz: list[tuple[float, float, float]] = []
         names: dict[str, int] = {}
         labels: dict[str, str] = {}
-        for i, shape, p in zip(part.ids, geometry, part.properties, strict=True):
+        sizes = shapely.get_num_coordinates(part.geometry).tolist()
+        for i, size, p in zip(part.ids, sizes, part.properties, strict=True):
             known, said = element_id(i), own(p, NAME)
-            if known and known[0] == "n" and not shape.is_empty:
-                row[known[1]] = len(xyz)
-                xyz.append(_xyz(shape))
+            refs: list[int] = []
+            if known and known[0] == "n" and size:
+                refs = [known[1]]
                 tags = as_texts(said.get("tags"))
                 if tags.get(NODE):
                     names.setdefault(tags[NODE], known[1])
                     labels.setdefault(tags[NODE], tags.get("name", ""))
-        for i, shape, p in zip(part.ids, geometry, part.properties, strict=True):
-            known, said = element_id(i), own(p, NAME)
-            refs, at = integers(said.get("refs")), _course(shape)
-            if not known or known[0] != "w" or refs is None:
-                continue
-            missing = set(integers(said.get("missing")) or ())
-            there = [r for k, r in enumerate(refs) if k not in missing]
-            if len(there) != len(at):
-                continue
-            ways[known[1]] = (there, as_texts(said.get("attributes")))
-            for r, place in zip(there, at, strict=True):
+            elif known and known[0] == "w":
+                missing = set(integers(said.get("missing")) or ())
+                refs = [r for k, r in enumerate(integers(said.get("refs")) or ()) if k not in missing]
+                if len(refs) != size:  # redrawn: its points are not those that it came with
+                    continue
+                ways[known[1]] = (refs, as_texts(said.get("attributes")))
+            for r in refs:
                 if r not in row:
                     row[r] = len(xyz)
-                    xyz.append(place)
+                    xyz.append(self.points[level.nodes[r]].xyz)
         rows = (
             (i, _members(said), as_texts(said.get("tags")), as_texts(said.get("attributes"))) for i, said in relations
         )
-        lanes, _ = lanes_of(rows, ways, row)
+        lanes, broken = lanes_of(rows, ways, row)
         table = Places(row, np.array(xyz, np.float64).reshape(-1, 3), "local" if local else "wgs84", names, labels)
         drawn = network(lanes, table, {})
-        return self.compared(lanes, drawn, networks)
+        out = self.compared(lanes, drawn, networks)
+        # A lanelet with a redrawn bound is written as it is drawn now; its edges stay with it.
+        redrawn = {i for i, _ in broken}
+        for key, net in networks.items():
+            own_edges = (
+                k for k, p in zip(net.ids, net.properties, strict=True) if own(p, NAME).get("lanelet") in redrawn
+            )
+            self.explained.setdefault(key, set()).update(own_edges)
+        return out
 
     def compared(
         self, lanes: Sequence[Lane], drawn: Features, networks: Mapping[PartKey, Features]
@@ -1154,7 +1174,7 @@ class _Writer:
 
     # --- XML ---
 
-    def text(self) -> str:
+    def text(self) -> bytes:
         nodes = self.placed_nodes()
         for what, times in sorted(self.lost.items()):
             self.context.drop(what, times, "a Lanelet2 map has no place for them")
@@ -1170,7 +1190,8 @@ class _Writer:
             places = self.layers.frame.to_wgs84(np.array([self.points[i].xyz[:2] for i in todo], np.float64))
             degrees = {i: (x, y) for i, (x, y) in zip(todo, places.tolist(), strict=True)}
         out = {}
-        for i, point in self.points.items():
+        while self.points:  # each point makes room for its node: there may be millions
+            i, point = self.points.popitem()
             if not point.local:
                 lon, lat = point.xyz[:2]
             else:

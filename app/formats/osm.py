@@ -491,7 +491,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
             context.drop("GNSS fence", len(part), "OSM has no word for it; its box is the map's bounds")
     if layers.datum is not None:
         context.drop("datum", 1, "OSM places stand on earth and have no local frame")
-    return {"map.osm": out.text().encode()}
+    return {"map.osm": out.text()}
 
 
 class _Writer:
@@ -896,7 +896,7 @@ class _Writer:
 
     # --- XML ---
 
-    def text(self) -> str:
+    def text(self) -> bytes:
         for what, times in sorted(self.lost.items()):
             self.context.drop(what, times, "OSM has no place for them")
         return _osm_text.document(self.head(), self.nodes, self.ways, self.relations)

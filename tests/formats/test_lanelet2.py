@@ -402,6 +402,22 @@ def test_a_lanelet_without_edges_goes_and_its_bounds_stay() -> None:
     assert told.dropped == [{"what": "lanelets whose edges are no longer in the network", "count": 1, "why": why}]
 
 
+def test_a_redrawn_bound_stays_with_its_lanelet() -> None:
+    layers, _ = read(JUNCTION)
+    objects = part(layers, OBJECTS)
+    shapes = objects.geometry.copy()
+    shapes[objects.ids.index("w22")] = shapely.LineString([(0.0, 0.0), (0.00005, -0.00001), (0.0001, 0.0)])
+    new = Features(objects.ids, shapes, objects.properties, objects.local.copy(), objects.document)
+    files, _ = write(Layers({**layers.parts, OBJECTS: new}, Datum(0.0, 0.0)))
+    found = elements(files[MAIN])
+    assert [kind for kind, _ in found].count("relation") == 7, "no lanelet beside it and none lost"
+    refs = found["way", 22]["refs"]
+    assert (refs[0], refs[-1], len(refs)) == (11, 12, 3)
+    again, _ = read(files[MAIN])
+    assert items(again).keys() == items(layers).keys()
+    assert len(items(again)["l101"][1].coords) == 3
+
+
 def test_a_new_edge_joins_the_lanelets_that_are_there() -> None:
     layers, _ = read(JUNCTION)
     net = part(layers)
