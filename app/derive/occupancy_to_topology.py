@@ -19,7 +19,9 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes, derives
-from app.errors import Ambiguous, CannotConvert, Invalid, NotFound, Problem, TooLarge
+from app.derive.occupancy_to_voxels import MASKS
+from app.errors import Ambiguous, CannotConvert, Invalid, MissingLayer, NotFound, Problem, TooLarge
+from app.model import masks
 from app.model.features import Features, Properties, from_columns, points
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, NETWORK, Layers, Part, PartKey
@@ -51,7 +53,7 @@ class Parameters:
         "how ways are found: the middle lines of free space, with straight ways through the open (skeleton), or random "
         "samples joined where nothing is between (roadmap)",
     )
-    grid: str | None = parameter(None, "which grid; default: map, else the only one of a level")
+    grid: str | None = parameter(None, "which grid; default: map, else the only one of a level that is no filter mask")
     robot_radius: float = parameter(
         0.3, "radius of the robot: no edge is nearer to an obstacle", minimum=0.0, maximum=100.0, unit="m"
     )
@@ -156,7 +158,7 @@ def _check(parameters: Parameters) -> None:
 
 
 def _chosen(layers: Layers, name: str | None) -> dict[PartKey, OccupancyGrid]:
-    """One grid for each level: the named one, else ``map``, else the only one."""
+    """One grid for each level: the named one, else ``map``, else the only one that is no costmap filter mask."""
     grids = layers.grids()
     if name is not None:
         found = {k: g for k, g in grids.items() if k.name == name}
@@ -165,8 +167,11 @@ def _chosen(layers: Layers, name: str | None) -> dict[PartKey, OccupancyGrid]:
             raise NotFound(f"there is no occupancy grid {name!r}; there are: {there}")
         return found
     out = {}
-    for level in dict.fromkeys(k.level for k in grids):
-        here = {k: g for k, g in grids.items() if k.level == level}
+    maps = {k: g for k, g in grids.items() if k.name not in MASKS and masks.NAME not in g.properties}
+    if not maps:
+        raise MissingLayer("costmap filter masks alone tell no ways: upload an occupancy grid of what stands there")
+    for level in dict.fromkeys(k.level for k in maps):
+        here = {k: g for k, g in maps.items() if k.level == level}
         plain = {k: g for k, g in here.items() if k.name == MAP} or here
         if len(plain) > 1:
             there = ", ".join(k.name for k in plain)

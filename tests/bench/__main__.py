@@ -15,10 +15,13 @@ import httpx
 from rich.console import Console
 from rich.table import Table
 
+from app import bundle
 from app.bundle import Hints
 from app.convert import offline
+from app.formats import Limits
 from app.model.frame import Datum
-from tests.bench import floors, http
+from app.model.grid import OccupancyGrid
+from tests.bench import floors, http, networks
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/"
@@ -200,20 +203,29 @@ def _repeated(client: httpx.Client, port: int, peer: int, auth: dict[str, str]) 
     return rows
 
 
+def farm_grid() -> OccupancyGrid:
+    """The real map of 4000 × 4000 cells."""
+    files = {name: (DATA / FARM / "metric/map" / name).read_bytes() for name in ("map.yaml", "map.png")}
+    told = bundle.read(files, Hints(), bundle.Known(None, None, None, True, False), Limits())
+    (grid,) = told.layers(None).grids().values()
+    return grid
+
+
 def main() -> int:
     """Print the tables (or JSON); exit status 1 where a bound does not hold."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
     parser.add_argument("--tries", type=int, default=7, help="counted runs of each conversion (default 7)")
     parser.add_argument("--json", action="store_true", help="machine-readable output")
-    parser.add_argument("--only", choices=["conversions", "serving"], help="one of the two tables")
+    parser.add_argument("--only", choices=["conversions", "serving", "networks"], help="one of the tables")
     arguments = parser.parse_args()
     if not DATA.is_dir():
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
         return 2
-    converted = conversions(arguments.tries) if arguments.only != "serving" else []
-    served = serving(arguments.tries) if arguments.only != "conversions" else []
+    converted = conversions(arguments.tries) if arguments.only in (None, "conversions") else []
+    served = serving(arguments.tries) if arguments.only in (None, "serving") else []
+    derived = networks.rows(farm_grid(), arguments.tries) if arguments.only in (None, "networks") else []
     if arguments.json:
-        print(json.dumps({"conversions": converted, "serving": served}, indent=2))
+        print(json.dumps({"conversions": converted, "serving": served, "networks": derived}, indent=2))
     else:
         console = Console(width=110)
         if converted:
@@ -230,9 +242,11 @@ def main() -> int:
                     "yes" if r["holds"] else "NO",
                 )
             console.print(table)
-        if served:
-            table = Table("served", "peer", "ours", "unit", "ratio", "bound", "holds")
-            for r in served:
+        for title, rows in (("served", served), ("grid → network", derived)):
+            if not rows:
+                continue
+            table = Table(title, "peer", "ours", "unit", "ratio", "bound", "holds")
+            for r in rows:
                 table.add_row(
                     r["what"],
                     f"{r['peer']:.1f}",
@@ -243,7 +257,7 @@ def main() -> int:
                     "yes" if r["holds"] else "NO",
                 )
             console.print(table)
-    return 0 if all(r["holds"] for r in [*converted, *served]) else 1
+    return 0 if all(r["holds"] for r in [*converted, *served, *derived]) else 1
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from app import derive, parameters
 from app.bundle import Hints, Known, read
 from app.derive import Notes
 from app.derive.occupancy_to_topology import Parameters, occupancy_to_topology
-from app.errors import Ambiguous, CannotConvert, Invalid, NotFound
+from app.errors import Ambiguous, CannotConvert, Invalid, MissingLayer, NotFound
 from app.formats import Limits
 from app.model.features import Features
 from app.model.frame import Level
@@ -349,6 +349,18 @@ def test_which_grid() -> None:
     parts[PartKey("occupancy", "L2", "second")] = g
     with pytest.raises(Ambiguous, match="only, second"):
         occupancy_to_topology(Layers(dict(parts), levels=layers.levels), Parameters(), Notes())
+
+
+def test_masks_are_no_maps_unless_named() -> None:
+    g = grid(rooms())
+    mask = Layers({PartKey("occupancy", "ground", "keepout"): g})
+    with pytest.raises(MissingLayer, match="masks alone"):
+        occupancy_to_topology(mask, Parameters(), Notes())
+    assert occupancy_to_topology(mask, Parameters(grid="keepout"), Notes()).parts
+    both = Layers({**mask.parts, PartKey("occupancy", "ground", "floor"): grid(rooms(1))})
+    (made,) = occupancy_to_topology(both, Parameters(), Notes()).parts.values()
+    assert isinstance(made, Features)
+    assert made.ids == derived(grid(rooms(1))).ids
 
 
 def test_parameters_are_checked() -> None:

@@ -1,0 +1,99 @@
+"""Grid -> network against what one would write with the libraries: skeletonize and skan, a roadmap with networkx."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import networkx as nx
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from skan import Skeleton
+from skimage.morphology import skeletonize
+
+from app.derive import Notes, _skeleton
+from app.derive.occupancy_to_topology import Parameters, network
+from app.model.grid import FREE, OccupancyGrid
+
+RADIUS = 0.3
+SAMPLES = 2000
+NEIGHBOURS = 10
+MAX_EDGE = 5.0
+
+
+def library_skeleton(mask: Any) -> int:
+    """scikit-image's thinning and skan's graph; how many pieces that graph has."""
+    graph = Skeleton(skeletonize(mask), keep_images=False)
+    return int(connected_components(graph.graph, directed=False)[0])
+
+
+def our_skeleton(grid: OccupancyGrid) -> int:
+    """From the grid's cells to the simplified graph, erosion included; how many pieces that graph has."""
+    found = _skeleton.free_cells(grid, unknown=False)
+    assert found is not None
+    where = _skeleton.space(*found, RADIUS / grid.resolution)
+    graph, _ = _skeleton.skeleton(where, merge=6.0, spur=10.0, tolerance=2.0, island=0.0)
+    return _skeleton.pieces(graph)[0]
+
+
+def plain_roadmap(grid: OccupancyGrid) -> nx.Graph:
+    """A roadmap as a textbook has it: a distance transform, a k-d tree, and a check along each line."""
+    clearance = distance_transform_edt(grid.cells == FREE) * grid.resolution
+    free = np.argwhere(clearance > RADIUS)
+    nodes = free[np.random.default_rng(0).choice(len(free), SAMPLES, replace=False)]
+    graph = nx.Graph()
+    graph.add_nodes_from(range(SAMPLES))
+    away, near = cKDTree(nodes).query(nodes, k=NEIGHBOURS + 1, distance_upper_bound=MAX_EDGE / grid.resolution)
+    for a in range(SAMPLES):
+        for length, b in zip(away[a, 1:], near[a, 1:], strict=True):
+            if b == SAMPLES or graph.has_edge(a, b):
+                continue
+            steps = int(np.ceil(2 * length)) + 1
+            line = np.rint(np.linspace(nodes[a], nodes[b], steps)).astype(int)
+            narrowest = clearance[line[:, 0], line[:, 1]].min()
+            if narrowest > RADIUS:
+                graph.add_edge(a, int(b), length=length * grid.resolution, width=2 * narrowest)
+    return graph
+
+
+def rows(grid: OccupancyGrid, tries: int) -> list[dict[str, Any]]:
+    """Ours and theirs in turns on the same grid."""
+    mask = distance_transform_edt(grid.cells == FREE) * grid.resolution > RADIUS * (1 + 1e-9)
+    roadmap = Parameters(
+        method="roadmap", robot_radius=RADIUS, samples=SAMPLES, neighbours=NEIGHBOURS, max_edge=MAX_EDGE
+    )
+    same = library_skeleton(mask) == our_skeleton(grid)
+    out = []
+    for what, theirs, ours, times in (
+        ("skeleton and graph", lambda: library_skeleton(mask), lambda: our_skeleton(grid), 5.0),
+        ("roadmap", lambda: plain_roadmap(grid), lambda: network(grid, roadmap, Notes(), "it"), 20.0),
+    ):
+        peer, mine = in_turns(theirs, ours, tries)
+        holds = peer >= times * mine and (same or what == "roadmap")
+        out.append(
+            {
+                "what": what,
+                "peer": peer,
+                "ours": mine,
+                "unit": "ms",
+                "ratio": peer / mine,
+                "bound": f"≥ {times:g}, same pieces" if what != "roadmap" else f"≥ {times:g}",
+                "holds": holds,
+            }
+        )
+    return out
+
+
+def in_turns(theirs: Callable[[], Any], ours: Callable[[], Any], tries: int) -> tuple[float, float]:
+    """Milliseconds of the fastest tries of both, each after one that does not count."""
+    best = [np.inf, np.inf]
+    for k in range(tries + 1):
+        for which, work in enumerate((theirs, ours)):
+            start = time.perf_counter()
+            work()
+            if k:
+                best[which] = min(best[which], (time.perf_counter() - start) * 1e3)
+    return best[0], best[1]
