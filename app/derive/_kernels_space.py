@@ -107,14 +107,19 @@ def clear(mask: U8, y0: int, x0: int, y1: int, x1: int) -> bool:
 
 @native
 def narrowest(gap: U16, y0: int, x0: int, y1: int, x1: int) -> int:
-    """The smallest squared distance to an obstacle over the cells that a straight line touches."""
+    """The smallest squared distance to an obstacle over the cells that a straight line touches.
+
+    From one cell to the next a distance changes by as much as the cells are apart at most, so that far from obstacles
+    most cells need not be looked at.
+    """
     dx, dy = abs(x1 - x0), abs(y1 - y0)
     sx, sy = (1 if x1 > x0 else -1), (1 if y1 > y0 else -1)
     x, y, i, j = x0, y0, 0, 0
     best = distance2(gap, y, x)
+    slack = 0.0  # how far a cell must be from here to be nearer to an obstacle than the nearest so far
     while not (i == dx and j == dy):
         side = (1 + 2 * i) * dy - (1 + 2 * j) * dx
-        if side == 0:
+        if side == 0 and slack < 1.5:
             best = min(best, distance2(gap, y, x + sx), distance2(gap, y + sy, x))
         if side <= 0:
             x += sx
@@ -122,7 +127,11 @@ def narrowest(gap: U16, y0: int, x0: int, y1: int, x1: int) -> int:
         if side >= 0:
             y += sy
             j += 1
-        best = min(best, distance2(gap, y, x))
+        slack -= 1.5  # more than a step to a diagonal neighbour
+        if slack < 0.0:
+            here = distance2(gap, y, x)
+            best = min(best, here)
+            slack = np.sqrt(here) - np.sqrt(best)
     return best
 
 

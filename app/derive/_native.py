@@ -15,6 +15,7 @@ import os
 import pkgutil
 import platform
 import shutil
+import signal
 import tempfile
 from collections.abc import Callable
 from importlib import metadata
@@ -61,7 +62,7 @@ def fill(where: Path) -> None:
     where.mkdir(parents=True, exist_ok=True)
     for old in where.glob(f"{_PREFIX}*"):  # of other releases
         shutil.rmtree(old, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=where) as scratch:
+    with tempfile.TemporaryDirectory(dir=where, prefix=f"{_PREFIX}part-") as scratch:
         os.environ[FOLDER] = scratch
         for module in _modules():
             importlib.import_module(module).compile_all()
@@ -73,6 +74,7 @@ def fill(where: Path) -> None:
 
 def fill_quietly(where: Path) -> None:
     """``fill`` for a process of its own: politely, and without a word where it cannot be done."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this process
     with contextlib.suppress(Exception):
         os.nice(10)
         fill(where)

@@ -14,8 +14,7 @@ from scipy.spatial import cKDTree
 from skan import Skeleton
 from skimage.morphology import skeletonize
 
-from app.derive import Notes, _skeleton
-from app.derive.occupancy_to_topology import Parameters, network
+from app.derive import _kernels_space, _roadmap, _skeleton
 from app.model.grid import FREE, OccupancyGrid
 
 RADIUS = 0.3
@@ -59,17 +58,27 @@ def plain_roadmap(grid: OccupancyGrid) -> nx.Graph:
     return graph
 
 
+def our_roadmap(grid: OccupancyGrid) -> tuple[Any, Any]:
+    """The same from the grid's cells on: the graph and the clearance of its edges, joined where free space is."""
+    found = _skeleton.free_cells(grid, unknown=False)
+    assert found is not None
+    where = _skeleton.space(*found, RADIUS / grid.resolution)
+    middle, _ = _skeleton.skeleton(where, merge=6.0, spur=10.0, tolerance=2.0, island=0.0)
+    far = MAX_EDGE / grid.resolution
+    graph, _ = _roadmap.roadmap(where, middle, samples=SAMPLES, neighbours=NEIGHBOURS, max_edge=far, seed=0)
+    width = np.empty(len(graph.edges))
+    _kernels_space.widths(where.gap, graph.nodes, graph.edges, width)
+    return graph, width
+
+
 def rows(grid: OccupancyGrid, tries: int) -> list[dict[str, Any]]:
     """Ours and theirs in turns on the same grid."""
     mask = distance_transform_edt(grid.cells == FREE) * grid.resolution > RADIUS * (1 + 1e-9)
-    roadmap = Parameters(
-        method="roadmap", robot_radius=RADIUS, samples=SAMPLES, neighbours=NEIGHBOURS, max_edge=MAX_EDGE
-    )
     same = library_skeleton(mask) == our_skeleton(grid)
     out = []
     for what, theirs, ours, times in (
         ("skeleton and graph", lambda: library_skeleton(mask), lambda: our_skeleton(grid), 5.0),
-        ("roadmap", lambda: plain_roadmap(grid), lambda: network(grid, roadmap, Notes(), "it"), 20.0),
+        ("roadmap", lambda: plain_roadmap(grid), lambda: our_roadmap(grid), 20.0),
     ):
         peer, mine = in_turns(theirs, ours, tries)
         holds = peer >= times * mine and (same or what == "roadmap")

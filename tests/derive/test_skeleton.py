@@ -166,6 +166,22 @@ def test_lines_visit_every_cell_they_touch() -> None:
     assert seen == {True, False}
 
 
+def test_the_narrowest_cell_of_a_line() -> None:
+    """Against all cells that the line touches, told by shapely, and scipy's distances."""
+    import shapely
+
+    random = np.random.default_rng(6)
+    for share in (0.01, 0.1):
+        free = np.pad((random.random((40, 40)) >= share).astype(np.uint8), 1)
+        gap = np.empty(free.shape, np.uint16)
+        space_kernels.gaps(free, gap)
+        expected = ndimage.distance_transform_edt(free)
+        boxes = [shapely.box(x - 0.5, y - 0.5, x + 0.5, y + 0.5) for y, x in np.ndindex(free.shape)]
+        for y0, x0, y1, x1 in random.integers(1, 41, (200, 4)):
+            touched = shapely.intersects(boxes, shapely.LineString([(x0, y0), (x1, y1)])).reshape(free.shape)
+            assert space_kernels.narrowest(gap, y0, x0, y1, x1) == round(expected[touched].min() ** 2)
+
+
 def network_of(graph: Any) -> nx.MultiGraph:
     nodes, start, end, begin, _ = graph
     g = nx.MultiGraph()
