@@ -9,6 +9,7 @@ that starting the server does not pay for it.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
 import importlib
 import os
@@ -32,6 +33,8 @@ _KERNELS = "_kernels_"
 
 
 _PREFIX = "fleetmap-native-"
+_PARENT_DEATH_SIGNAL = 1
+"""prctl's, linux/prctl.h."""
 
 
 def folder() -> Path:
@@ -76,6 +79,7 @@ def fill_quietly(where: Path) -> None:
     """``fill`` for a process of its own: politely, and without a word where it cannot be done."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this process
     with contextlib.suppress(Exception):
+        ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)  # it ends with the server, however that ends
         os.nice(10)
         fill(where)
 
