@@ -39,6 +39,7 @@ from app.api import (
     openapi,
     problems,
     provenance,
+    robots,
     tokens,
     transform,
     versions,
@@ -58,6 +59,7 @@ from app.convert import Maps
 from app.errors import FleetMapError, Unavailable
 from app.events.bus import Bus, BusOptions
 from app.events.relay import Relay
+from app.fleet import Intake as FleetIntake
 from app.ingest import Ingest
 from app.pool import Pool
 from app.sandbox import Allowed
@@ -128,6 +130,7 @@ def create_app(settings: Settings) -> Server:
         events,
         manifest,
         provenance,
+        robots,
         jobs,
         tokens,
     ):
@@ -257,6 +260,7 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         metrics=metrics,
         keys=Keys(settings.data_dir / "keys"),
         deltas=Deltas(service.cache),
+        fleet=FleetIntake(store),
     )
 
 
@@ -273,20 +277,16 @@ def relay_of(settings: Settings, here: Services) -> Relay | None:
         max_reply_bytes=settings.zenoh_max_reply_bytes,
     )
 
-    def status(environment: str, robot: str, payload: bytes) -> None:
-        log.debug("status of %s in %s: %d bytes", robot, environment, len(payload))
-
-    def alive(robot: str, there: bool) -> None:
-        log.debug("%s is %s", robot, "there" if there else "gone")
-
-    bus = Bus(options, ask=partial(events.ask, here), on_status=status, on_alive=alive)
+    bus = Bus(options, ask=partial(events.ask, here), on_status=here.fleet.heard, on_alive=here.fleet.alive)
     relay = Relay(here.store, bus, settings.data_dir)
+    here.fleet.start()
     relay.start()
     return relay
 
 
 def close_services(here: Services) -> None:
     """End workers, remove the spool, close the store. Blocks."""
+    here.fleet.close()
     here.pool.close()
     here.work.close()
     here.intake.close()

@@ -24,10 +24,11 @@ from app.api.problems import Throttled
 from app.errors import Denied, Unauthenticated
 from app.store.values import Role, Token
 
-Need = Literal["viewer", "editor", "admin"]
+Need = Literal["viewer", "robot", "editor", "admin"]
 
 _CAN: dict[Need, frozenset[Role]] = {
     "viewer": frozenset({"viewer", "robot", "editor", "admin"}),
+    "robot": frozenset({"robot", "editor", "admin"}),
     "editor": frozenset({"editor", "admin"}),
     "admin": frozenset({"admin"}),
 }
@@ -211,8 +212,9 @@ class AtLeast:
         return principal
 
 
-viewer, editor, admin = AtLeast("viewer"), AtLeast("editor"), AtLeast("admin")
+viewer, robot, editor, admin = AtLeast("viewer"), AtLeast("robot"), AtLeast("editor"), AtLeast("admin")
 
 Viewer = Annotated[Principal, Depends(viewer)]
+Reporter = Annotated[Principal, Depends(robot)]
 Editor = Annotated[Principal, Depends(editor)]
 Admin = Annotated[Principal, Depends(admin)]

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
 from fastapi import APIRouter
 from starlette.responses import Response
 
+from app import fleet
 from app.api.access import Editor, Viewer
 from app.api.answers import Route, answer
 from app.api.schemas import ChannelBody, ChannelOut, ChannelPath, EnvironmentPath, told
-from app.api.services import Here
+from app.api.services import Here, Services
 from app.errors import Invalid, Problem
-from app.store.values import LATEST, Channel, rfc3339
+from app.store.values import LATEST, Channel, Robot, rfc3339
 
 router = APIRouter(prefix="/environments/{env}/channels", tags=["channels"], route_class=Route)
 
 
-def as_dict(channel: Channel) -> dict[str, Any]:
-    """The channel as clients see it."""
+def as_dict(channel: Channel, robots: Sequence[Robot], now: datetime) -> dict[str, Any]:
+    """The channel as clients see it, with how its robots stand. robots: of the environment."""
     planned = None
     if channel.planned is not None:
         planned = {
             "version": channel.planned.version,
+            "root": channel.planned.root,
             "activate_at": rfc3339(channel.planned.activate_at),
             "author": channel.planned.author,
         }
@@ -35,13 +38,23 @@ def as_dict(channel: Channel) -> dict[str, Any]:
         "author": channel.author,
         "time": rfc3339(channel.time),
         "planned": planned,
+        "robots": fleet.holding(robots, channel, now, channel.planned.root if channel.planned else None).as_dict(),
     }
+
+
+def _one(here: Services, env: str, channel: Channel) -> dict[str, Any]:
+    return as_dict(channel, here.store.robots(env), datetime.now(UTC))
 
 
 @router.get("", responses=told(list[ChannelOut], 404), summary="All channels")
 def list_channels(env: EnvironmentPath, here: Here, _: Viewer) -> Response:
-    """`latest` first, then the others by name, with what is planned for them."""
-    return answer([as_dict(channel) for channel in here.store.channels(env)])
+    """`latest` first, then the others by name, with what is planned for them, and how their robots stand.
+
+    `robots.since` is told where all robots of a channel hold its root: from then on they have. `holding`, `lagging` and
+    `failed` make up the `total`; `ready` have what is planned.
+    """
+    robots, now = here.store.robots(env), datetime.now(UTC)
+    return answer([as_dict(channel, robots, now) for channel in here.store.channels(env)])
 
 
 @router.put("/{channel}", responses=told(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan it")
@@ -55,7 +68,8 @@ def move_channel(env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, 
         if body.activate_at <= datetime.now(UTC):
             raise _refused("activate_at is in the past: leave it out to move now")
     version = here.store.version(env, body.version).number
-    return answer(as_dict(here.store.set_channel(env, channel, version, author=who.name, activate_at=body.activate_at)))
+    moved = here.store.set_channel(env, channel, version, author=who.name, activate_at=body.activate_at)
+    return answer(_one(here, env, moved))
 
 
 def _refused(detail: str) -> Invalid:

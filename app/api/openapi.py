@@ -33,7 +33,8 @@ All errors are `application/problem+json` (RFC 9457). Lists come in pages: the `
 Versions are named by number, by channel (`production`), or `latest`. Coordinates are `longitude, latitude` in GeoJSON
 and `latitude, longitude` in query parameters, as their names say.
 
-Access: `Authorization: Bearer <token>`. Roles: `viewer` and `robot` read; `editor` also uploads, edits, converts, moves
+Access: `Authorization: Bearer <token>`. Roles: `viewer` and `robot` read, `robot` also tells
+the status of the robot that its token names; `editor` also uploads, edits, converts, moves
 channels and sets datums; `admin` does all.
 """
 
@@ -113,6 +114,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("layers", "Canonical content."),
             ("maps", "Maps in a format, converted on demand."),
             ("channels", "Which version robots drive on."),
+            ("robots", "Who holds what, who lags."),
             ("events", "Every change as it happens."),
             ("manifest", "What a robot verifies."),
             ("transform", "Between earth and local frame."),

@@ -229,6 +229,31 @@ class ChannelBody(In):
     )
 
 
+class StatusBody(In):
+    """What a robot says of itself."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={
+            "examples": [
+                {"environment": "farm", "channel": "latest", "version": 1, "root": "0" * 64, "state": "active"}
+            ]
+        },
+    )
+
+    environment: str = Field(pattern=NAME)
+    channel: str = Field(pattern=CHANNEL, description="The channel that it follows.")
+    version: int = Field(ge=0, lt=2**63)
+    root: str = Field(pattern=r"^[0-9a-f]{64}$", description="Of the version, as the manifest says it.")
+    state: Literal["downloading", "ready", "active", "failed"] = Field(
+        description="`ready`: it has the version and does not drive on it yet; `active`: it does."
+    )
+    detail: str | None = Field(None, max_length=2000)
+    time: Moment | None = Field(None, description="RFC 3339 time with zone, by the robot's clock.")
+    sequence: int | None = Field(None, ge=0, lt=2**63, description="Of the last event that it has processed.")
+
+
 class TokenBody(In):
     """A new token."""
 
@@ -365,6 +390,18 @@ class ReportOut(BaseModel):
     warnings: list[ProblemItem]
 
 
+class ChannelRobotsOut(BaseModel):
+    """How a channel's robots stand. ``since``: from when on all hold its root; null while any does not."""
+
+    total: int
+    online: int
+    holding: int
+    lagging: int
+    failed: int
+    ready: int
+    since: datetime | None
+
+
 class ChannelOut(BaseModel):
     """A movable name for a version."""
 
@@ -375,6 +412,51 @@ class ChannelOut(BaseModel):
     author: str
     time: datetime
     planned: dict[str, Any] | None = None
+    robots: ChannelRobotsOut
+
+
+class LagOut(BaseModel):
+    """How far a robot is behind its channel: events not acted on, whether its root differs, since when."""
+
+    events: int
+    differs: bool
+    since: datetime | None
+
+
+class HoldsOut(BaseModel):
+    """What a robot drives on, and since when it said so (the server's clock)."""
+
+    version: int
+    root: str
+    since: datetime
+
+
+class RobotOut(BaseModel):
+    """A robot in an environment. ``time``: by its clock, where it told one; ``received`` and ``since`` (when it first
+    said the same) by the server's. ``lag`` is null where its channel stands nowhere.
+    """
+
+    robot: str
+    environment: str
+    channel: str
+    version: int
+    root: str
+    state: Literal["downloading", "ready", "active", "failed"]
+    detail: str | None = None
+    sequence: int | None = None
+    time: datetime
+    received: datetime
+    since: datetime
+    holds: HoldsOut | None
+    online: bool
+    lag: LagOut | None
+
+
+class RobotDetailOut(RobotOut):
+    """A robot with its past."""
+
+    environments: list[str]
+    history: list[dict[str, Any]]
 
 
 class TransformOut(BaseModel):
@@ -508,6 +590,10 @@ VersionPath = Annotated[
     ),
 ]
 ChannelPath = Annotated[str, Path(pattern=CHANNEL, description="A channel's name.", examples=["production"])]
+RobotPath = Annotated[
+    str,
+    Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$", description="A robot's name.", examples=["mower-3"]),
+]
 FormatPath = Annotated[
     str, Path(max_length=64, description="A format's id; see `GET /api/v1/formats`.", examples=["geojson"])
 ]

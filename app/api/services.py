@@ -10,6 +10,7 @@ from fastapi import Depends, Request
 
 from app.api.access import Access
 from app.convert import Maps
+from app.fleet import Intake as FleetIntake
 from app.formats import Limits
 from app.ingest import Ingest
 from app.pool import Pool
@@ -54,6 +55,7 @@ class Services:
     metrics: Metrics
     keys: Keys
     deltas: Deltas
+    fleet: FleetIntake
 
 
 async def services(request: Request) -> Services:

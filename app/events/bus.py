@@ -68,10 +68,10 @@ Ask = Callable[[str, str, Mapping[str, str]], Answer]
 """(environment, the key after it, parameters) -> answer. Raises FleetMapError."""
 
 OnStatus = Callable[[str, str, bytes], None]
-"""(environment, robot, payload)."""
+"""(environment, robot, payload). It must return at once."""
 
 OnAlive = Callable[[str, bool], None]
-"""(robot, whether its session is there)."""
+"""(robot, whether its session is there). It must return at once."""
 
 
 def router_configuration(options: BusOptions) -> str:
@@ -272,17 +272,13 @@ class Bus:
             self._waiting.release()
             _drop(query)
 
-    def _hand_over(self, function: Callable[..., None], *arguments: Any) -> None:
-        def call() -> None:
-            try:
-                function(*arguments)
-            except FleetMapError as error:
-                log.warning("a message over Zenoh was left out: %s", error.detail)
-            except Exception:
-                log.exception("a message over Zenoh could not be taken")
-
-        with contextlib.suppress(RuntimeError):
-            self._threads.submit(call)
+    @staticmethod
+    def _hand_over(function: Callable[..., None], *arguments: Any) -> None:
+        """In this very thread, so that a robot's messages stay in order: who takes them only queues them."""
+        try:
+            function(*arguments)
+        except Exception:
+            log.exception("a message over Zenoh could not be taken")
 
     def _answer(self, query: zenoh.Query) -> None:
         try:

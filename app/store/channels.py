@@ -27,16 +27,22 @@ class Channels(Base):
                     version.c.environment_id == row.id, version.c.number == row.head
                 )
             ).one()
+            planned = version.alias("planned")
             query = (
-                select(table, version.c.root)
+                select(table, version.c.root, planned.c.root.label("planned_root"))
                 .outerjoin(
                     version,
                     (version.c.environment_id == table.c.environment_id) & (version.c.number == table.c.version),
                 )
+                .outerjoin(
+                    planned,
+                    (planned.c.environment_id == table.c.environment_id)
+                    & (planned.c.number == table.c.planned_version),
+                )
                 .where(table.c.environment_id == row.id)
                 .order_by(table.c.name)
             )
-            others = [_as_channel(r, r.root) for r in connection.execute(query)]
+            others = [_as_channel(r, r.root, r.planned_root) for r in connection.execute(query)]
         return [Channel(LATEST, row.head, row.root, head.sequence, None, head.author, head.time), *others]
 
     def standing(self, environment: str, ref: str | int) -> tuple[Version, int]:
@@ -138,13 +144,16 @@ def _read(connection: Connection, environment: Row[Any], channel: str) -> Channe
     if row is None:
         raise NotFound(f"{environment.name} has no channel {channel!r}")
     root = None if row.version is None else read_version(connection, environment, row.version).root
-    return _as_channel(row, root)
-
-
-def _as_channel(row: Row[Any], root: str | None) -> Channel:
     planned = None
     if row.planned_version is not None:
-        planned = Planned(row.planned_version, row.planned_at, row.planned_author or "")
+        planned = read_version(connection, environment, row.planned_version).root
+    return _as_channel(row, root, planned)
+
+
+def _as_channel(row: Row[Any], root: str | None, planned_root: str | None) -> Channel:
+    planned = None
+    if row.planned_version is not None:
+        planned = Planned(row.planned_version, row.planned_at, row.planned_author or "", planned_root or "")
     return Channel(row.name, row.version, root, row.sequence, planned, row.author, row.time)
 
 

@@ -21,6 +21,8 @@ from app.store.tree import Draft
 IDEMPOTENCY_DAYS: Final = 7
 EVENT_DAYS: Final = 30
 JOB_DAYS: Final = 7
+ROBOT_DAYS: Final = 90
+"""After so long in silence a robot is no longer part of the fleet."""
 PAGE: Final = 500
 
 
@@ -31,8 +33,9 @@ class Collection(Base):
         """Remove chunks and blobs that no version refers to and that were not written or used within ``grace``.
 
         ``{chunks, blobs, bytes, temporary}``: how many went, bytes of the blobs. Old idempotency keys (7 days),
-        finished jobs (7 days) and events of purged environments (30 days) go too. ``grace`` must be longer than any
-        upload takes. Damaged where a version's chunk is: nothing is removed then. One process at a time should collect.
+        finished jobs (7 days), robots that are silent (90 days) and events of purged environments (30 days) go too.
+        ``grace`` must be longer than any upload takes. Damaged where a version's chunk is: nothing is removed then. One
+        process at a time should collect.
         """
         self._chunks.forget()
         before = int(time.time() - grace.total_seconds()) + (1 if not grace else 0)
@@ -82,6 +85,9 @@ class Collection(Base):
         known, keys, jobs = tables.event, tables.idempotency, tables.job
         with self._database.write() as connection:
             connection.execute(delete(keys).where(keys.c.time < now - timedelta(days=IDEMPOTENCY_DAYS)))
+            silent = now - timedelta(days=ROBOT_DAYS)
+            for table in (tables.robot, tables.robot_history, tables.presence):
+                connection.execute(delete(table).where(table.c.time < silent))
             finished = jobs.c.state.in_(("done", "failed", "cancelled"))
             connection.execute(delete(jobs).where(finished, jobs.c.updated < now - timedelta(days=JOB_DAYS)))
             connection.execute(

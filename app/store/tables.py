@@ -315,6 +315,56 @@ job = Table(
     Column("updated", Moment, nullable=False),
 )
 
+
+def _report() -> list[Column[Any]]:
+    """What a robot says of itself. said: when, by its own clock; time: when it was heard, by the server's."""
+    return [
+        Column("channel", String(63), nullable=False),
+        Column("version", BigInteger, nullable=False),
+        Column("root", String(64), nullable=False),
+        Column("state", String(16), nullable=False),
+        Column("detail", Text, nullable=True),
+        Column("sequence", BigInteger, nullable=True),
+        Column("said", Moment, nullable=True),
+        Column("time", Moment, nullable=False),
+    ]
+
+
+robot = Table(
+    "robot",
+    metadata,
+    _environment(primary_key=True),
+    Column("robot", String(128), primary_key=True, index=True),
+    *_report(),
+    Column("since", Moment, nullable=False),
+    Column("held_version", BigInteger, nullable=True),
+    Column("held_root", String(64), nullable=True),
+    Column("held_sequence", BigInteger, nullable=True),
+    Column("held_since", Moment, nullable=True),
+)
+"""Robots as they are now, for each environment. since: when they first said this. held: what they drive on, which a
+report of a map that is still being fetched does not change."""
+
+robot_history = Table(
+    "robot_history",
+    metadata,
+    Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
+    _environment(nullable=False),
+    Column("robot", String(128), nullable=False),
+    *_report(),
+    Index("ix_robot_history_robot", "environment_id", "robot", "id"),
+)
+"""What robots said, each time that it was something new; the newest of each robot are kept."""
+
+presence = Table(
+    "presence",
+    metadata,
+    Column("robot", String(128), primary_key=True),
+    Column("there", Boolean, nullable=False),
+    Column("time", Moment, nullable=False),
+)
+"""Robots' liveliness on the bus. time: of the change, and while they are there of the last look."""
+
 place = Table(
     "place",
     metadata,

@@ -20,6 +20,7 @@ EDIT = "edit"
 
 Information = Literal["raw", "derived", "template", "generated"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
+RobotState = Literal["downloading", "ready", "active", "failed"]
 Role = Literal["viewer", "robot", "editor", "admin"]
 
 Box = tuple[float, float, float, float]
@@ -251,6 +252,7 @@ class Planned:
     version: int
     activate_at: datetime
     author: str = ""
+    root: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,6 +319,67 @@ class Job:
     created: datetime
     updated: datetime
     owner: str
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What a robot says of itself. said: when, by its own clock. sequence: of the last event that it has processed."""
+
+    channel: str
+    version: int
+    root: str
+    state: RobotState
+    detail: str | None = None
+    sequence: int | None = None
+    said: datetime | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A report, of whom, and when it was heard by the server's clock."""
+
+    environment: str
+    robot: str
+    report: Report
+    time: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """What a robot drives on. sequence: of the event that it acted on, where it says so. since: server's clock."""
+
+    version: int
+    root: str
+    sequence: int | None
+    since: datetime
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """A robot in one environment, as it is now.
+
+    time: of its last report. since: when it first said the same. there: its liveliness on the bus, as of ``seen``;
+    None where it never was on the bus.
+    """
+
+    robot: str
+    environment: str
+    report: Report
+    time: datetime
+    since: datetime
+    held: Held | None
+    there: bool | None = None
+    seen: datetime | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """An event that brought a channel to a version."""
+
+    sequence: int
+    version: int
+    root: str
+    time: datetime
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,6 +25,8 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
         api.post("environments", {"name": "farm", "title": "The farm"})
         files = {"network.tmap2.yaml": samples.tmap2(), "datum.yaml": samples.DATUM, **samples.grid()}
         api.upload("farm", files)
+        said = {"environment": "farm", "channel": "latest", "version": 1, "root": "0" * 64, "state": "ready"}
+        api("PUT", "robots/mower-3/status", 200, json=said)
         yield api
 
 
@@ -50,6 +52,7 @@ def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
         f"{e}/channels/{{channel}}/planned": "delete", f"{e}/transform": "get", "/api/v1/convert": "post",
         "/api/v1/derivations": "get", "/api/v1/events": "get", f"{v}/provenance": "get",
         "/api/v1/keys": "get post", f"{v}/manifest": "get", f"{e}/derivations": "post",
+        "/api/v1/robots": "get", "/api/v1/robots/{robot}": "get delete", "/api/v1/robots/{robot}/status": "put",
         "/api/v1/jobs/{id}": "get delete", "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete",
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
     }  # fmt: skip

@@ -1,0 +1,147 @@
+"""Robots: who holds what since when, who lags."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query
+from starlette.responses import Response
+
+from app import fleet
+from app.api.access import Editor, Principal, Reporter, Viewer
+from app.api.answers import Route, answer
+from app.api.schemas import CHANNEL, NAME, RobotDetailOut, RobotOut, RobotPath, StatusBody, told
+from app.api.services import Here, Services
+from app.errors import Denied, Invalid, NotFound, Problem
+from app.store.values import Channel, Heard, Move, Report, Robot, rfc3339
+
+router = APIRouter(prefix="/robots", tags=["robots"], route_class=Route)
+
+EnvironmentQuery = Annotated[
+    str | None, Query(pattern=NAME, description="Only in this environment; else in all that the token reaches.")
+]
+
+
+@router.get("", responses=told(list[RobotOut], 404), summary="All robots")
+def list_robots(
+    here: Here,
+    who: Viewer,
+    environment: EnvironmentQuery = None,
+    channel: Annotated[str | None, Query(pattern=CHANNEL, description="Only on this channel.")] = None,
+) -> Response:
+    """What each says of itself, what it drives on, whether it is there, and how far it is behind its channel."""
+    if environment is not None:
+        who.enter(environment)
+    found = [r for r in here.store.robots(environment) if who.may_enter(r.environment)]
+    return answer(_told(here, [r for r in found if channel is None or r.report.channel == channel]))
+
+
+@router.get("/{robot}", responses=told(RobotDetailOut, 404), summary="One robot, with what it said before")
+def get_robot(
+    robot: RobotPath,
+    here: Here,
+    who: Viewer,
+    environment: EnvironmentQuery = None,
+    limit: Annotated[int, Query(ge=1, le=200, description="Reports in `history`.")] = 50,
+) -> Response:
+    """In the environment where it reported last, unless one is named. `history`: newest first, each time that it said
+    something new; `environments`: all in which it reported.
+    """
+    found = [r for r in here.store.robots(None, robot) if who.may_enter(r.environment)]
+    if environment is not None:
+        who.enter(environment)
+    chosen = [r for r in found if environment is None or r.environment == environment]
+    if not chosen:
+        where = "" if environment is None else f" in {environment}"
+        raise NotFound(f"no robot {robot[:80]!r} has reported{where}")
+    newest = max(chosen, key=lambda r: r.time)
+    history = here.store.robot_history(newest.environment, robot, limit)
+    (body,) = _told(here, [newest])
+    body["environments"] = [r.environment for r in found]
+    body["history"] = [{**_report(report, time), "received": rfc3339(time)} for time, report in history]
+    return answer(body)
+
+
+@router.put("/{robot}/status", responses=told(RobotOut, 400, 404, 409, 415), summary="A robot says what it holds")
+def put_status(robot: RobotPath, body: StatusBody, here: Here, who: Reporter) -> Response:
+    """The same as over Zenoh. A robot's token may tell of the robot that it names; editors may tell of any."""
+    may_report(who, robot)
+    who.enter(body.environment)
+    if body.time is not None and body.time.tzinfo is None:
+        raise Invalid("time needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="body.time")])
+    report = Report(body.channel, body.version, body.root, body.state, body.detail, body.sequence, body.time)
+    return answer(noted(here, body.environment, robot, report))
+
+
+@router.delete("/{robot}", status_code=204, responses=told(None, 404), summary="Forget a robot that is gone for good")
+def forget_robot(
+    robot: RobotPath,
+    here: Here,
+    who: Editor,
+    environment: Annotated[str, Query(pattern=NAME, description="Where it is to be forgotten.", examples=["farm"])],
+) -> Response:
+    """It no longer counts among its channel's robots. It comes back with its next report."""
+    who.enter(environment)
+    here.store.forget_robot(environment, robot)
+    return Response(status_code=204)
+
+
+def may_report(who: Principal, robot: str) -> None:
+    """Denied for a robot's token that names another robot, or none."""
+    if who.role != "robot" or who.robot == robot:
+        return
+    names = "names no robot" if who.robot is None else f"names the robot {who.robot}"
+    raise Denied(f"your token {names}: it cannot tell the status of {robot[:128]}")
+
+
+def noted(here: Services, environment: str, robot: str, report: Report) -> dict[str, Any]:
+    """Store a report; the robot as it is now."""
+    (refused,) = here.store.note_reports([Heard(environment, robot, report, datetime.now(UTC))])
+    if refused is not None:
+        raise refused
+    return _told(here, here.store.robots(environment, robot))[0]
+
+
+def _told(here: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
+    now = datetime.now(UTC)
+    channels: dict[str, dict[str, Channel]] = {}
+    moves: dict[tuple[str, str], list[Move]] = {}
+    out = []
+    for robot in robots:
+        name = robot.report.channel
+        if robot.environment not in channels:
+            channels[robot.environment] = {c.name: c for c in here.store.channels(robot.environment)}
+        channel = channels[robot.environment].get(name)
+        lag = None
+        if channel is not None and channel.root is not None:
+            behind = robot.held is None or robot.held.root != channel.root
+            if behind and (robot.environment, name) not in moves:
+                moves[robot.environment, name] = here.store.moves(robot.environment, name)
+            lag = fleet.lag_of(robot, channel, moves.get((robot.environment, name), [])).as_dict()
+        held = robot.held
+        body = {"robot": robot.robot, "environment": robot.environment, **_report(robot.report, robot.time)}
+        body |= {
+            "received": rfc3339(robot.time),
+            "since": rfc3339(robot.since),
+            "holds": held and {"version": held.version, "root": held.root, "since": rfc3339(held.since)},
+            "online": fleet.is_online(robot, now),
+            "lag": lag,
+        }
+        out.append(body)
+    return out
+
+
+def _report(report: Report, heard: datetime) -> dict[str, Any]:
+    body: dict[str, Any] = {
+        "channel": report.channel,
+        "version": report.version,
+        "root": report.root,
+        "state": report.state,
+    }
+    if report.detail is not None:
+        body["detail"] = report.detail
+    if report.sequence is not None:
+        body["sequence"] = report.sequence
+    return body | {"time": rfc3339(report.said or heard)}

@@ -1,0 +1,159 @@
+"""What robots say over the bus, into the store: in order, many in one transaction, also when the database was away."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+from app.errors import FleetMapError, Invalid, Unavailable
+from app.events.messages import ROBOT_NAME, RobotStatus
+from app.store import Store
+from app.store.base import ENVIRONMENT_NAME
+from app.store.values import Heard, Report
+
+log = logging.getLogger(__name__)
+
+WAITING = 20_000
+"""So many reports wait for the database; of further ones it is told that they were left out."""
+
+BATCH = 500
+RENEW_SECONDS = 15.0
+RETRY_SECONDS = 1.0
+MAX_PRESENT = 100_000
+
+
+def report_of(status: RobotStatus) -> Report:
+    """A status as the store takes it. A time that is none counts as not told: nothing depends on robots' clocks."""
+    said = None
+    if status.time is not None:
+        with contextlib.suppress(ValueError, OverflowError):
+            said = datetime.fromisoformat(status.time)
+            said = said.astimezone(UTC) if said.tzinfo is not None else None
+    return Report(status.channel, status.version, status.root, status.state, status.detail, status.sequence, said)
+
+
+class Intake:
+    """Reports and liveliness from the bus. ``heard`` and ``alive`` return at once; a thread writes."""
+
+    def __init__(self, store: Store, clock: Callable[[], datetime] = lambda: datetime.now(UTC)) -> None:
+        self._store, self._clock = store, clock
+        self._queue: queue.Queue[tuple[str, str, bytes, datetime] | None] = queue.Queue(WAITING)
+        self._there: set[str] = set()
+        self._gone: set[str] = set()
+        self._new: set[str] = set()
+        self._lock = threading.Lock()
+        self._lost = 0
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Begin to write."""
+        self._thread = threading.Thread(target=self._run, name="fleetmap-fleet", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Write what waits, then end."""
+        self._ending.set()
+        with contextlib.suppress(queue.Full):
+            self._queue.put_nowait(None)
+        if self._thread is not None:
+            self._thread.join(10)
+
+    def heard(self, environment: str, robot: str, payload: bytes) -> None:
+        """A robot's status as it came."""
+        try:
+            self._queue.put_nowait((environment, robot, payload, self._clock()))
+        except queue.Full:
+            self._lost += 1
+
+    def alive(self, robot: str, there: bool) -> None:
+        """A robot's session came or went."""
+        if not ROBOT_NAME.fullmatch(robot):
+            return
+        with self._lock:
+            if there and len(self._there) < MAX_PRESENT:
+                self._there.add(robot)
+                self._new.add(robot)
+                self._gone.discard(robot)
+            elif not there:
+                self._there.discard(robot)
+                self._new.discard(robot)
+                self._gone.add(robot)
+        with contextlib.suppress(queue.Full):
+            self._queue.put_nowait(None)
+
+    def _run(self) -> None:
+        renewed = time.monotonic()
+        batch: list[Heard] = []
+        while True:
+            batch += self._take(RENEW_SECONDS / 3 if not batch else 0.0, BATCH - len(batch))
+            renew = time.monotonic() - renewed > RENEW_SECONDS
+            try:
+                self._write_presence(everybody=renew)
+                renewed = time.monotonic() if renew else renewed
+                self._write(batch)
+                batch = []
+            except Unavailable as error:
+                log.warning("reports of robots wait: %s", error.detail)
+                if self._ending.wait(RETRY_SECONDS):
+                    return
+            except Exception:
+                log.exception("reports of robots could not be taken")
+                batch = []
+            if self._ending.is_set() and self._queue.empty():
+                return
+
+    def _take(self, seconds: float, most: int) -> list[Heard]:
+        out: list[Heard] = []
+        deadline = time.monotonic() + seconds
+        while len(out) < most:
+            try:
+                item = (
+                    self._queue.get(timeout=max(0.0, deadline - time.monotonic()))
+                    if not out
+                    else (self._queue.get_nowait())
+                )
+            except queue.Empty:
+                break
+            if item is None:
+                break
+            found = _read(*item)
+            if found is not None:
+                out.append(found)
+        if self._lost:
+            log.error("%d reports of robots were left out: they come faster than they can be stored", self._lost)
+            self._lost = 0
+        return out
+
+    def _write(self, batch: list[Heard]) -> None:
+        if not batch:
+            return
+        for heard, refused in zip(batch, self._store.note_reports(batch), strict=True):
+            if refused is not None:
+                log.warning("a report of %s was left out: %s", heard.robot, refused.detail)
+
+    def _write_presence(self, *, everybody: bool) -> None:
+        with self._lock:
+            there = set(self._there if everybody else self._new)
+            gone = set(self._gone)
+        if not there and not gone:
+            return
+        self._store.note_presence(there, gone, self._clock())
+        with self._lock:
+            self._new -= there
+            self._gone -= gone
+
+
+def _read(environment: str, robot: str, payload: bytes, time: datetime) -> Heard | None:
+    try:
+        if not ROBOT_NAME.fullmatch(robot) or not ENVIRONMENT_NAME.fullmatch(environment):
+            raise Invalid("a robot's or environment's name cannot be used")
+        return Heard(environment, robot, report_of(RobotStatus.from_json(payload)), time)
+    except FleetMapError as error:
+        log.warning("a report of %.128r in %.64r was left out: %s", robot, environment, error.detail)
+        return None

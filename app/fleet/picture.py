@@ -1,0 +1,118 @@
+"""What follows from what robots said: who is online, who lags, whether all of a channel hold its root.
+
+All times are the server's clock, so that robots' clocks count for nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any
+
+from app.store.values import Channel, Move, Robot, rfc3339
+
+REPORT_FRESH = timedelta(seconds=180)
+"""A robot that is not on the bus is online for so long after a report."""
+
+PRESENCE_FRESH = timedelta(seconds=60)
+"""A presence is renewed every 15 seconds; where nobody renews it, it counts for no longer than this."""
+
+
+def is_online(robot: Robot, now: datetime) -> bool:
+    """By its liveliness on the bus where that is newer than its last report, else by a recent report."""
+    if robot.seen is not None:
+        if robot.there and now - robot.seen < PRESENCE_FRESH:
+            return True
+        if not robot.there and robot.seen >= robot.time:
+            return False
+    return now - robot.time < REPORT_FRESH
+
+
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """How far a robot is behind its channel.
+
+    events: of its channel that it has not acted on. differs: whether its root is not the channel's. since: when the
+    first of these events was; None where it does not lag.
+    """
+
+    events: int
+    differs: bool
+    since: datetime | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-like."""
+        return {
+            "events": self.events,
+            "differs": self.differs,
+            "since": None if self.since is None else rfc3339(self.since),
+        }
+
+
+def lag_of(robot: Robot, channel: Channel, moves: Sequence[Move]) -> Lag:
+    """A robot's lag. moves: of the channel, oldest first.
+
+    A robot that says no sequence has acted on the newest move that led to the root which it holds.
+    """
+    held = robot.held
+    if held is not None and held.root == channel.root:
+        return Lag(0, False, None)
+    acted = 0
+    if held is not None:
+        acted = held.sequence or next((m.sequence for m in reversed(moves) if m.root == held.root), 0)
+    missed = [move for move in moves if move.sequence > acted]
+    since = missed[0].time if missed else robot.since
+    return Lag(len(missed), True, since)
+
+
+@dataclass(frozen=True, slots=True)
+class Holding:
+    """How a channel's robots stand: each is one of holding, failed and lagging.
+
+    holding: drive on the channel's root. failed: do not, and say that they failed. ready: have the version that is
+    planned. since: from when on all of them hold the root; None while any does not.
+    """
+
+    total: int
+    online: int
+    holding: int
+    lagging: int
+    failed: int
+    ready: int
+    since: datetime | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-like."""
+        return {
+            "total": self.total,
+            "online": self.online,
+            "holding": self.holding,
+            "lagging": self.lagging,
+            "failed": self.failed,
+            "ready": self.ready,
+            "since": None if self.since is None else rfc3339(self.since),
+        }
+
+
+def is_ready(robot: Robot, root: str) -> bool:
+    """Whether a robot has a root, so that it could drive on it at once."""
+    loaded = robot.report.state in ("ready", "active") and robot.report.root == root
+    return loaded or (robot.held is not None and robot.held.root == root)
+
+
+def holding(robots: Iterable[Robot], channel: Channel, now: datetime, planned: str | None = None) -> Holding:
+    """The proof of convergence of one channel. robots: of its environment; planned: root of what comes next."""
+    own = [robot for robot in robots if robot.report.channel == channel.name]
+    hold = [robot.held.since for robot in own if robot.held is not None and robot.held.root == channel.root]
+    behind = [robot for robot in own if robot.held is None or robot.held.root != channel.root]
+    failed = sum(robot.report.state == "failed" for robot in behind)
+    return Holding(
+        total=len(own),
+        online=sum(is_online(robot, now) for robot in own),
+        holding=len(hold),
+        lagging=len(behind) - failed,
+        failed=failed,
+        ready=0 if planned is None else sum(is_ready(robot, planned) for robot in own),
+        since=max([*hold, channel.time]) if own and not behind else None,
+    )

@@ -1,0 +1,195 @@
+"""Robots: what they said last, what they drive on, the history of both, and which of them are on the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from datetime import datetime
+from typing import Any, Final
+
+from sqlalchemy import Connection, Row, Select, delete, func, insert, select, update
+from sqlalchemy.dialects import postgresql, sqlite
+
+from app.errors import Conflict, FleetMapError, NotFound
+from app.store import tables
+from app.store.base import Base, clean, environment_row
+from app.store.values import LATEST, Heard, Held, Move, Report, Robot
+
+HISTORY: Final = 200
+"""So many reports of each robot in each environment are kept."""
+
+MAX_ROBOTS: Final = 10_000
+"""So many robots report in one environment; on an open router anybody can make up names."""
+
+MAX_PRESENT: Final = 100_000
+MAX_MOVES: Final = 1000
+"""So many moves of a channel are looked back on."""
+
+
+class Robots(Base):
+    """The fleet's memory."""
+
+    def note_reports(self, heard: Sequence[Heard]) -> list[FleetMapError | None]:
+        """Take in what robots say, in the order given, in one transaction: for each None, or why it was refused.
+
+        The same said again only renews the time. NotFound where there is no such environment, Conflict where it has
+        too many robots already.
+        """
+        out: list[FleetMapError | None] = [None] * len(heard)
+        with self._database.write(tell=False) as connection:
+            owners: dict[str, str | FleetMapError] = {}
+            # One order for all writers, so that none waits for another that waits for it; each robot's own order stays.
+            for k in sorted(range(len(heard)), key=lambda k: (heard[k].environment, heard[k].robot)):
+                name = heard[k].environment
+                if name not in owners:
+                    try:
+                        owners[name] = environment_row(connection, name).id
+                    except NotFound as error:
+                        owners[name] = error
+                owner = owners[name]
+                out[k] = owner if isinstance(owner, FleetMapError) else _note(connection, owner, heard[k])
+        return out
+
+    def robots(self, environment: str | None = None, robot: str | None = None) -> list[Robot]:
+        """Robots by environment and name, of environments that are not deleted; NotFound for an unknown environment."""
+        table, owner = tables.robot, tables.environment
+        with self._database.read() as connection:
+            query = _robots().where(owner.c.deleted.is_(None)).order_by(owner.c.name, table.c.robot)
+            if environment is not None:
+                query = query.where(table.c.environment_id == environment_row(connection, environment).id)
+            if robot is not None:
+                query = query.where(table.c.robot == robot)
+            return [_as_robot(row) for row in connection.execute(query)]
+
+    def robot_history(self, environment: str, robot: str, limit: int = HISTORY) -> list[tuple[datetime, Report]]:
+        """What a robot said in an environment and when it was heard, newest first, each time it was something new."""
+        table = tables.robot_history
+        with self._database.read() as connection:
+            row = environment_row(connection, environment)
+            query = (
+                select(table)
+                .where(table.c.environment_id == row.id, table.c.robot == robot)
+                .order_by(table.c.id.desc())
+                .limit(limit)
+            )
+            return [(r.time, _as_report(r)) for r in connection.execute(query)]
+
+    def forget_robot(self, environment: str, robot: str) -> None:
+        """Remove a robot and its history from an environment; NotFound. It comes back with its next report."""
+        with self._database.write(tell=False) as connection:
+            row = environment_row(connection, environment)
+            for table in (tables.robot_history, tables.robot):
+                gone = connection.execute(
+                    delete(table).where(table.c.environment_id == row.id, table.c.robot == robot)
+                ).rowcount
+            if not gone:
+                raise NotFound(f"no robot {robot[:80]!r} has reported in {environment}")
+
+    def note_presence(self, there: Collection[str], gone: Collection[str], now: datetime) -> None:
+        """Robots that are on the bus at this moment, and robots that have left it."""
+        table = tables.presence
+        with self._database.write(tell=False) as connection:
+            room = MAX_PRESENT - int(connection.execute(select(func.count()).select_from(table)).scalar_one())
+            make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
+            rows = sorted([(name, True) for name in there] + [(name, False) for name in gone])
+            for name, is_there in rows:
+                if room < len(rows):  # full: who is known stays known
+                    connection.execute(update(table).where(table.c.robot == name).values(there=is_there, time=now))
+                    continue
+                statement = make(table).values(robot=name, there=is_there, time=now)
+                connection.execute(
+                    statement.on_conflict_do_update(
+                        index_elements=["robot"],
+                        set_={"there": statement.excluded.there, "time": statement.excluded.time},
+                    )
+                )
+
+    def moves(self, environment: str, channel: str) -> list[Move]:
+        """The newest events that brought a channel somewhere, oldest first; of ``latest`` each new version."""
+        table = tables.event
+        kind = "version.created" if channel == LATEST else "channel.moved"
+        with self._database.read() as connection:
+            row = environment_row(connection, environment)
+            query = select(table.c.sequence, table.c.body, table.c.time).where(
+                table.c.environment_id == row.id, table.c.body["type"].as_string() == kind
+            )
+            if channel != LATEST:
+                query = query.where(table.c.body["channel"].as_string() == channel)
+            rows = connection.execute(query.order_by(table.c.sequence.desc()).limit(MAX_MOVES)).all()
+        return [Move(r.sequence, r.body["version"], r.body["root"], r.time) for r in reversed(rows)]
+
+
+def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMapError | None:
+    table, report = tables.robot, heard.report
+    own = (table.c.environment_id == environment_id, table.c.robot == heard.robot)
+    known = connection.execute(select(table).where(*own).with_for_update()).one_or_none()
+    said: dict[str, Any] = {
+        "channel": report.channel,
+        "version": report.version,
+        "root": report.root,
+        "state": report.state,
+        "detail": None if report.detail is None else clean(report.detail),
+        "sequence": report.sequence,
+    }
+    values: dict[str, Any] = {**said, "said": report.said, "time": heard.time}
+    again = known is not None and all(getattr(known, name) == value for name, value in said.items())
+    if not again:
+        values["since"] = heard.time
+    if report.state == "active":
+        same = known is not None and known.held_root == report.root
+        values |= {"held_version": report.version, "held_root": report.root, "held_sequence": report.sequence}
+        values["held_since"] = known.held_since if same and known is not None else heard.time
+    if known is not None:
+        connection.execute(update(table).where(*own).values(values))
+    else:
+        others = select(func.count()).select_from(table).where(table.c.environment_id == environment_id)
+        if connection.execute(others).scalar_one() >= MAX_ROBOTS:
+            return Conflict(f"{heard.environment} has {MAX_ROBOTS} robots: remove some that are gone")
+        make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
+        statement = make(table).values(environment_id=environment_id, robot=heard.robot, **values)
+        connection.execute(
+            statement.on_conflict_do_update(index_elements=["environment_id", "robot"], set_=values)  # a race's winner
+        )
+    if not again:
+        _remember(connection, environment_id, heard, said)
+    return None
+
+
+def _remember(connection: Connection, environment_id: str, heard: Heard, said: dict[str, Any]) -> None:
+    table = tables.robot_history
+    connection.execute(
+        insert(table).values(
+            environment_id=environment_id, robot=heard.robot, said=heard.report.said, time=heard.time, **said
+        )
+    )
+    own = (table.c.environment_id == environment_id, table.c.robot == heard.robot)
+    oldest = select(table.c.id).where(*own).order_by(table.c.id.desc()).offset(HISTORY).limit(1)
+    last = connection.execute(oldest).scalar_one_or_none()
+    if last is not None:
+        connection.execute(delete(table).where(*own, table.c.id <= last))
+
+
+def _robots() -> Select[Any]:
+    table, owner, presence = tables.robot, tables.environment, tables.presence
+    return (
+        select(table, owner.c.name.label("environment"), presence.c.there, presence.c.time.label("seen"))
+        .join(owner, owner.c.id == table.c.environment_id)
+        .outerjoin(presence, presence.c.robot == table.c.robot)
+    )
+
+
+def robots_of(connection: Connection, environment_id: str, channel: str) -> list[Robot]:
+    """The robots of a channel, within a transaction."""
+    table = tables.robot
+    query = _robots().where(table.c.environment_id == environment_id, table.c.channel == channel)
+    return [_as_robot(row) for row in connection.execute(query.order_by(table.c.robot))]
+
+
+def _as_report(row: Row[Any]) -> Report:
+    return Report(row.channel, row.version, row.root, row.state, row.detail, row.sequence, row.said)
+
+
+def _as_robot(row: Row[Any]) -> Robot:
+    held = None
+    if row.held_root is not None:
+        held = Held(row.held_version, row.held_root, row.held_sequence, row.held_since)
+    return Robot(row.robot, row.environment, _as_report(row), row.time, row.since, held, row.there, row.seen)

@@ -1,0 +1,101 @@
+"""Robots over HTTP: who may tell what, who holds what, who lags."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tests.api.conftest import Api
+
+
+def status(env: str, root: str, state: str = "active", **more: Any) -> dict[str, Any]:
+    return {"environment": env, "channel": "production", "version": 2, "root": root, "state": state, **more}
+
+
+def root_of(api: Api, env: str, version: int) -> str:
+    return str(api.get(f"environments/{env}/versions/{version}").json()["root"])
+
+
+def test_a_robot_tells_its_status(api: Api, farm: str) -> None:
+    api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
+    robot = api.token_for("robot", robot="mower-1", environments=farm)
+    root = root_of(api, farm, 2)
+    said = status(farm, root, detail="fine", sequence=5, time="2031-01-01T00:00:00+01:00")
+    told = robot("PUT", "robots/mower-1/status", 200, json=said).json()
+    assert {k: told[k] for k in ("robot", "environment", "channel", "version", "root", "state", "detail")} == {
+        "robot": "mower-1", "environment": farm, "channel": "production", "version": 2, "root": root,
+        "state": "active", "detail": "fine",
+    }  # fmt: skip
+    assert told["time"] == "2030-12-31T23:00:00.000000Z"
+    assert told["online"] is True
+    assert told["lag"] == {"events": 0, "differs": False, "since": None}
+    assert told["holds"] == {"version": 2, "root": root, "since": told["received"]}
+    assert robot.get(f"robots?environment={farm}").json() == [told]
+    moved = api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 3}).json()
+    (now,) = api.get(f"robots?environment={farm}&channel=production").json()
+    assert now["lag"] == {"events": 1, "differs": True, "since": moved["time"]}
+    assert api.get(f"robots?environment={farm}&channel=staging").json() == []
+    api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
+    assert api.get(f"robots/mower-1?environment={farm}").json()["lag"]["events"] == 0
+
+
+def test_history_of_a_robot(api: Api, farm: str) -> None:
+    for state in ("downloading", "downloading", "ready", "active"):
+        api("PUT", "robots/digger/status", 200, json=status(farm, "a" * 64, state))
+    told = api.get("robots/digger").json()
+    assert [h["state"] for h in told["history"]] == ["active", "ready", "downloading"]
+    assert told["environments"] == [farm]
+    assert told["lag"] is None, "the channel stands nowhere"
+    assert len(api.get("robots/digger?limit=1").json()["history"]) == 1
+    api("DELETE", f"robots/digger?environment={farm}", 204)
+    api.problem("GET", "robots/digger", 404)
+    api.problem("DELETE", f"robots/digger?environment={farm}", 404)
+
+
+def test_who_may_tell(api: Api, farm: str, bare: str) -> None:
+    said = status(farm, "a" * 64)
+    mine = api.token_for("robot", robot="r-1", environments=farm)
+    for caller in (mine, api.token_for("editor"), api):
+        caller("PUT", "robots/r-1/status", 200, json=said)
+    assert "names the robot r-1" in mine.problem("PUT", "robots/r-2/status", 403, json=said)["detail"]
+    mine.problem("PUT", "robots/r-1/status", 403, json=status(bare, "a" * 64))
+    assert "names no robot" in api.token_for("robot").problem("PUT", "robots/r-1/status", 403, json=said)["detail"]
+    api.token_for("viewer").problem("PUT", "robots/r-1/status", 403, json=said)
+    mine.problem("DELETE", f"robots/r-1?environment={farm}", 403)
+    other = api.token_for("viewer", environments=bare)
+    assert other.get("robots").json() == []
+    other.problem("GET", f"robots?environment={farm}", 403)
+    other.problem("GET", "robots/r-1", 404)
+    other.problem("GET", f"robots/r-1?environment={farm}", 403)
+
+
+def test_bad_statuses_are_refused(api: Api, farm: str) -> None:
+    good = status(farm, "a" * 64)
+    for bad in (
+        {"root": "A" * 64}, {"state": "happy"}, {"version": -1}, {"channel": "No"},
+        {"detail": "x" * 2001}, {"time": "tomorrow"}, {"time": "2031-01-01T00:00:00"},
+        {"sequence": -1}, {"more": 1}, {"environment": "../x"},
+    ):  # fmt: skip
+        api.problem("PUT", "robots/r/status", 422, json={**good, **bad})
+    api.problem("PUT", "robots/-r/status", 422, json=good)
+    api.problem("PUT", "robots/r/status", 404, json={**good, "environment": "nowhere"})
+    api.problem("GET", "robots?environment=nowhere", 404)
+
+
+def test_all_robots_hold_the_root(api: Api, farm: str) -> None:
+    def stand() -> Any:
+        channels = {c["channel"]: c for c in api.get(f"environments/{farm}/channels").json()}
+        return channels["production"]["robots"]
+
+    moved = api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2}).json()
+    assert moved["robots"]["total"] == 0
+    roots = {v: root_of(api, farm, v) for v in (2, 3)}
+    for k in range(3):
+        api("PUT", f"robots/fleet-{k}/status", 200, json=status(farm, roots[2 + (k > 1)]))
+    assert {k: stand()[k] for k in ("total", "holding", "lagging", "since")} == {
+        "total": 3, "holding": 2, "lagging": 1, "since": None,
+    }  # fmt: skip
+    last = api("PUT", "robots/fleet-2/status", 200, json=status(farm, roots[2])).json()
+    assert stand() == {
+        "total": 3, "online": 3, "holding": 3, "lagging": 0, "failed": 0, "ready": 0,
+        "since": last["holds"]["since"],
+    }  # fmt: skip

@@ -1,0 +1,114 @@
+"""Robots on the bus: their statuses and their liveliness reach GET /robots."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from typing import Any
+
+import pytest
+import zenoh
+
+from app.errors import Unavailable
+from app.fleet import Intake
+from app.store import Store
+from tests.api.conftest import Api
+from tests.events.conftest import client_config, eventually
+from tests.events.test_relay import router_of
+
+
+def said(n: int, state: str = "active") -> bytes:
+    body = {"channel": "latest", "version": n, "root": f"{n:064x}", "state": state, "sequence": n}
+    return json.dumps(body).encode()
+
+
+def robot_of(api: Api, name: str) -> Any:
+    answer = api.get(f"robots/{name}", expect=None)
+    return answer.json() if answer.status_code == 200 else None
+
+
+def test_statuses_come_in_order(api: Api, session: zenoh.Session) -> None:
+    api.post("environments", {"name": "farm"})
+    for n in range(150):
+        session.put("fleetmap/farm/robots/r1/status", said(n, "downloading" if n % 2 else "active"))
+    session.put("fleetmap/farm/robots/r1/status", b"{}")
+    session.put("fleetmap/nowhere/robots/r1/status", said(1))
+    session.put("fleetmap/farm/robots/r2/status", said(7))
+    eventually(lambda: robot_of(api, "r2"))
+    told = eventually(lambda: (r := robot_of(api, "r1")) and r["version"] == 149 and r)
+    assert told["holds"]["version"] == 148
+    history = api.get("robots/r1?limit=200").json()["history"]
+    assert [h["sequence"] for h in history] == list(range(149, -1, -1))
+    assert [r["robot"] for r in api.get("robots?environment=farm").json()] == ["r1", "r2"]
+
+
+def test_liveliness(api: Api, port: int) -> None:
+    api.post("environments", {"name": "farm"})
+    robot = zenoh.open(client_config(port))
+    try:
+        token = robot.liveliness().declare_token("fleetmap/robots/r1")
+        robot.put("fleetmap/farm/robots/r1/status", said(1))
+        assert eventually(lambda: (r := robot_of(api, "r1")) and r["online"])
+        token.undeclare()  # type: ignore[no-untyped-call]
+        assert eventually(lambda: not robot_of(api, "r1")["online"])
+        token = robot.liveliness().declare_token("fleetmap/robots/r1")
+        assert eventually(lambda: robot_of(api, "r1")["online"])
+    finally:
+        robot.close()  # type: ignore[no-untyped-call]
+    assert eventually(lambda: not robot_of(api, "r1")["online"])
+
+
+def test_a_robot_that_vanished_with_the_router_is_not_there(api: Api, port: int) -> None:
+    api.post("environments", {"name": "farm"})
+    tokens = []
+    stays, leaves = zenoh.open(client_config(port)), zenoh.open(client_config(port))
+    try:
+        for name, session in (("stays", stays), ("leaves", leaves)):
+            tokens.append(session.liveliness().declare_token(f"fleetmap/robots/{name}"))
+            session.put(f"fleetmap/farm/robots/{name}/status", said(1))
+            assert eventually(lambda name=name: (r := robot_of(api, name)) and r["online"])
+        os.kill(router_of(api), signal.SIGKILL)
+        leaves.close()  # type: ignore[no-untyped-call]
+        assert eventually(lambda: not robot_of(api, "leaves")["online"], 30)
+        assert eventually(lambda: robot_of(api, "stays")["online"], 30)
+    finally:
+        stays.close()  # type: ignore[no-untyped-call]
+
+
+def test_reports_wait_for_a_database_that_is_away(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    store: Store = api.app.state.services.store
+    store.create_environment("farm")
+    note, calls = store.note_reports, []
+
+    def away(batch: Any) -> Any:
+        calls.append(len(batch))
+        if len(calls) < 3:
+            raise Unavailable("away")
+        return note(batch)
+
+    monkeypatch.setattr(store, "note_reports", away)
+    intake = Intake(store)
+    intake.start()
+    intake.heard("farm", "r1", said(1))
+    intake.heard("farm", "r1", said(2))
+    eventually(lambda: len(store.robot_history("farm", "r1")) == 2)
+    assert len(calls) >= 3
+    intake.heard("farm", "r1", said(3))
+    intake.close()
+    assert [r.version for _, r in store.robot_history("farm", "r1")] == [3, 2, 1], "what waits is written at the end"
+
+
+def test_what_comes_too_fast_is_told(
+    api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("app.fleet.intake.WAITING", 2)
+    store: Store = api.app.state.services.store
+    store.create_environment("farm")
+    intake = Intake(store)
+    for n in range(5):
+        intake.heard("farm", "r1", said(n))
+    intake.start()
+    intake.close()
+    assert [r.version for _, r in store.robot_history("farm", "r1")] == [1, 0]
+    assert "3 reports of robots were left out" in caplog.text

@@ -1,0 +1,218 @@
+"""What robots said, kept on both databases."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import pytest
+
+from app.errors import Conflict, NotFound
+from app.fleet import holding, is_online, lag_of
+from app.store import Store, robots
+from app.store.changes import Replace
+from app.store.values import Heard, Held, Move, Report
+from tests.store.samples import DATUM, GRID, grid, save
+
+NOW = datetime(2031, 5, 1, 14, 0, tzinfo=UTC)
+A, B = "a" * 64, "b" * 64
+
+
+def heard(robot: str, minute: float, root: str = A, state: Any = "active", **more: Any) -> Heard:
+    """A report, so many minutes after NOW."""
+    version = more.pop("version", 1)
+    channel = more.pop("channel", "production")
+    environment = more.pop("environment", "farm")
+    report = Report(channel, version, root, state, **more)
+    return Heard(environment, robot, report, NOW + timedelta(minutes=minute))
+
+
+@pytest.fixture
+def farm(store: Store) -> Store:
+    store.create_environment("farm")
+    return store
+
+
+def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
+    said = NOW - timedelta(hours=5)
+    assert farm.note_reports([heard("r1", 0, A, detail="ok\x00", sequence=4, said=said)]) == [None]
+    (robot,) = farm.robots("farm")
+    assert robot.report == Report("production", 1, A, "active", "ok\ufffd", 4, said)
+    assert (robot.environment, robot.robot, robot.time, robot.since) == ("farm", "r1", NOW, NOW)
+    assert robot.held == Held(1, A, 4, NOW)
+    assert (robot.there, robot.seen) == (None, None)
+    farm.note_reports([heard("r1", 1, B, "downloading", version=2), heard("r1", 2, B, "failed", version=2)])
+    (robot,) = farm.robots("farm", "r1")
+    assert (robot.report.state, robot.report.version) == ("failed", 2)
+    assert robot.held == Held(1, A, 4, NOW)
+    farm.note_reports([heard("r1", 3, B, version=2, sequence=9), heard("r1", 4, B, version=2, sequence=9)])
+    (robot,) = farm.robots("farm", "r1")
+    assert robot.held == Held(2, B, 9, NOW + timedelta(minutes=3))
+    assert (robot.since, robot.time) == (NOW + timedelta(minutes=3), NOW + timedelta(minutes=4))
+    history = farm.robot_history("farm", "r1")
+    assert [(t, r.state) for t, r in history] == [
+        (NOW + timedelta(minutes=m), state)
+        for m, state in ((3, "active"), (2, "failed"), (1, "downloading"), (0, "active"))
+    ]
+    assert len(farm.robot_history("farm", "r1", limit=2)) == 2
+
+
+def test_robots_of_several_environments(farm: Store):
+    farm.create_environment("yard")
+    refused = farm.note_reports(
+        [heard("r2", 0), heard("r1", 0), heard("r1", 0, environment="nowhere"), heard("r1", 1, environment="yard")]
+    )
+    assert [type(r) for r in refused] == [type(None), type(None), NotFound, type(None)]
+    assert [(r.environment, r.robot) for r in farm.robots()] == [("farm", "r1"), ("farm", "r2"), ("yard", "r1")]
+    assert [r.environment for r in farm.robots(robot="r1")] == ["farm", "yard"]
+    farm.delete_environment("yard")
+    assert [r.environment for r in farm.robots(robot="r1")] == ["farm"]
+    with pytest.raises(NotFound):
+        farm.robots("nowhere")
+    farm.purge_environment("yard")
+    farm.forget_robot("farm", "r1")
+    assert [r.robot for r in farm.robots()] == ["r2"]
+    assert farm.robot_history("farm", "r1") == []
+    with pytest.raises(NotFound, match="r1"):
+        farm.forget_robot("farm", "r1")
+
+
+def test_history_and_fleet_are_bounded(farm: Store, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(robots, "HISTORY", 5)
+    monkeypatch.setattr(robots, "MAX_ROBOTS", 2)
+    farm.note_reports([heard("r1", k, version=k) for k in range(12)] + [heard("r2", 0)])
+    assert [r.version for _, r in farm.robot_history("farm", "r1")] == [11, 10, 9, 8, 7]
+    assert len(farm.robot_history("farm", "r2")) == 1
+    (refused,) = farm.note_reports([heard("r3", 0)])
+    assert isinstance(refused, Conflict)
+    assert farm.note_reports([heard("r2", 1)]) == [None]
+    assert [r.robot for r in farm.robots()] == ["r1", "r2"]
+
+
+def test_many_writers_of_the_same_robots(farm: Store):
+    def write(k: int) -> None:
+        names = [f"r{n}" for n in range(6)]
+        for name in names if k % 2 else reversed(names):
+            assert farm.note_reports([heard(name, k, version=k), heard("r0", k, version=k)]) == [None, None]
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write, range(8)))
+    assert [r.robot for r in farm.robots("farm")] == [f"r{n}" for n in range(6)]
+
+
+def test_presence(farm: Store, monkeypatch: pytest.MonkeyPatch):
+    farm.note_reports([heard("r1", 0), heard("r2", 0)])
+    farm.note_presence({"r1", "r2", "r9"}, set(), NOW)
+    later = NOW + timedelta(minutes=9)
+    farm.note_presence({"r1"}, {"r2"}, later)
+    assert [(r.robot, r.there, r.seen) for r in farm.robots()] == [("r1", True, later), ("r2", False, later)]
+    monkeypatch.setattr(robots, "MAX_PRESENT", 3)
+    farm.note_reports([heard("r3", 0)])
+    farm.note_presence({"r2", "r3"}, {"r1"}, later)
+    assert [(r.robot, r.there) for r in farm.robots()] == [("r1", False), ("r2", True), ("r3", None)]
+
+
+def test_silent_robots_are_tidied_away(farm: Store):
+    old = datetime.now(UTC) - timedelta(days=91)
+    farm.note_reports([Heard("farm", "old", Report("latest", 0, A, "active"), old)])
+    farm.note_reports([Heard("farm", "new", Report("latest", 0, A, "active"), datetime.now(UTC))])
+    farm.note_presence({"old"}, set(), old)
+    farm.collect(timedelta(hours=6))
+    assert [r.robot for r in farm.robots()] == ["new"]
+    assert farm.robot_history("farm", "old") == []
+
+
+def test_moves_of_channels(farm: Store):
+    first = save(farm, "farm", Replace(GRID, grid()))
+    second = save(farm, "farm", Replace(GRID, grid(seed=1)))
+    farm.set_channel("farm", "production", 2, author="ann")
+    farm.set_channel("farm", "staging", 1, author="ann")
+    farm.set_channel("farm", "production", 1, author="ann")
+    farm.set_channel("farm", "production", 2, author="ann", activate_at=NOW)
+    assert [(m.sequence, m.version, m.root) for m in farm.moves("farm", "latest")] == [
+        (2, 1, first.root), (3, 2, second.root),
+    ]  # fmt: skip
+    assert [(m.sequence, m.version) for m in farm.moves("farm", "production")] == [(4, 2), (6, 1)]
+    assert farm.moves("farm", "none") == []
+
+
+def test_convergence_is_proved(farm: Store):
+    old, new = (save(farm, "farm", Replace(GRID, grid(seed=k))).root for k in range(2))
+    channel = farm.set_channel("farm", "production", 2, author="ann")
+    base = channel.time
+
+    def say(robot: str, seconds: float, root: str, state: Any = "active", **more: Any) -> None:
+        report = Report(more.pop("channel", "production"), 0, root, state, **more)
+        farm.note_reports([Heard("farm", robot, report, base + timedelta(seconds=seconds))])
+
+    def stand(seconds: float = 60) -> Any:
+        return holding(farm.robots("farm"), channel, base + timedelta(seconds=seconds))
+
+    assert stand().as_dict() == {
+        "total": 0, "online": 0, "holding": 0, "lagging": 0, "failed": 0, "ready": 0, "since": None,
+    }  # fmt: skip
+    say("a", -100, new)
+    say("b", 3, old, sequence=1)
+    say("c", 4, new, "failed")
+    say("d", 4, old, channel="staging")
+    now = stand()
+    assert (now.total, now.online, now.holding, now.lagging, now.failed, now.since) == (3, 3, 1, 1, 1, None)
+    assert stand(1000).online == 0
+    say("b", 5, new)
+    say("b", 9, new)
+    say("c", 7, new)
+    now = stand()
+    assert (now.total, now.holding, now.lagging, now.failed) == (3, 3, 0, 0)
+    assert now.since == base + timedelta(seconds=7)
+    farm.forget_robot("farm", "b")
+    farm.forget_robot("farm", "c")
+    assert stand().since == base, "before the channel came there, nobody held the channel's root"
+    # What comes next is fetched, while the present is held.
+    planned = farm.set_channel("farm", "production", 1, author="ann", activate_at=base + timedelta(hours=1))
+    assert planned.planned is not None
+    assert planned.planned.root == old
+    say("a", 20, old, "ready")
+    ready = holding(farm.robots("farm"), planned, base, old)
+    assert (ready.holding, ready.ready) == (1, 1)
+
+
+def test_lag_counts_the_events_not_acted_on(sqlite_store: Store):
+    farm = sqlite_store
+    farm.create_environment("farm", datum=DATUM)
+    channel = next(c for c in farm.channels("farm"))
+    moves = [Move(n, n, str(n) * 64, NOW + timedelta(minutes=n)) for n in (2, 5, 7)]
+    from dataclasses import replace
+
+    channel = replace(channel, root=moves[-1].root)
+
+    def lag(*reports: Heard) -> Any:
+        farm.note_reports(list(reports))
+        (robot,) = farm.robots("farm", reports[0].robot)
+        found = lag_of(robot, channel, moves)
+        return found.events, found.differs, found.since and (found.since - NOW) / timedelta(minutes=1)
+
+    assert lag(heard("in-step", 0, moves[2].root)) == (0, False, None)
+    assert lag(heard("told", 0, moves[1].root, sequence=5)) == (1, True, 7)
+    assert lag(heard("untold", 0, moves[0].root)) == (2, True, 5)
+    assert lag(heard("foreign", 0, A)) == (3, True, 2)
+    assert lag(heard("empty", 0, moves[2].root, "downloading")) == (3, True, 2)
+    assert lag(heard("ahead", 4, A, sequence=9)) == (0, True, 4)
+
+
+@pytest.mark.parametrize(
+    ("report", "there", "seen", "online"),
+    [
+        (-1, None, None, True), (-4, None, None, False),
+        (-4, True, -0.5, True), (-4, True, -2, False), (-1, True, -2, True),
+        (-1, False, -0.5, False), (-1, False, -2, True), (-1, False, -1, False),
+    ],
+)  # fmt: skip
+def test_who_is_online(sqlite_store: Store, report: float, there: bool | None, seen: float | None, online: bool):
+    sqlite_store.create_environment("farm")
+    sqlite_store.note_reports([heard("r", report)])
+    if seen is not None:
+        at = NOW + timedelta(minutes=seen)
+        sqlite_store.note_presence({"r"} if there else set(), set() if there else {"r"}, at)
+    (robot,) = sqlite_store.robots()
+    assert is_online(robot, NOW) is online
