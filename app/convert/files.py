@@ -54,6 +54,10 @@ def offline(
         told = bundle.read(
             unpacked, hints, Known(datum, None, wanted, not known.outlines, known.drawing or known.holds), limits
         )
+        have = told.layers(datum).layers
+        if not asked and any(layers <= have for layers in known.needs.one_of):
+            # Nothing is asked by name and nothing has to be derived: not read again, and who sent it need not keep it.
+            wanted, files, unpacked = None, {}, {}
         try:
             written = _made(known, told, datum, asked, derived=derived)
             break
@@ -82,5 +86,11 @@ def offline_paths(
     limits: Limits,
 ) -> Converted:
     """The same from spooled files: what a worker process is asked to do."""
-    files = {name: path.read_bytes() for name, path in paths.items()}
-    return offline(files, to, hints=hints, datum=datum, options=options, limits=limits)
+    return offline(
+        {name: path.read_bytes() for name, path in paths.items()},
+        to,
+        hints=hints,
+        datum=datum,
+        options=options,
+        limits=limits,
+    )

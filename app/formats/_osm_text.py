@@ -14,6 +14,9 @@ from typing import Any
 from app.formats._osm import INT64
 from app.formats._text import DEGREES, numbers
 
+SHARED = 4096
+"""Mappings of attributes whose text is kept for the next element."""
+
 NOTHING: Mapping[str, str] = {}
 
 LINES = 10_000
@@ -67,6 +70,8 @@ def _lines(
         known = cache.get(id(said))
         if known is None:
             # Keyed by identity: thousands of elements of one changeset share one mapping, which lives here.
+            if len(cache) >= SHARED:
+                cache.clear()  # a file in which every element has its own history
             known = cache[id(said)] = attribute_text(said, RESERVED)
         return known
 

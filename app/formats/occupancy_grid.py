@@ -12,6 +12,7 @@ Frame: local; ``origin`` = [x, y, yaw] of the lower left corner, metres and radi
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import re
@@ -530,7 +531,17 @@ def _picture(grid: OccupancyGrid, pixels: Table, kind: Literal["pgm", "png"]) ->
     table = pixels.tobytes()
     if kind == "pgm":
         header = f"P5\n{grid.width} {grid.height}\n255\n".encode()
-        return header + grid.cells[::-1].tobytes().translate(table)
+        out = io.BytesIO()
+        out.seek(len(header) + grid.cells.size - 1)
+        out.write(
+            b"\0"
+        )  # all of it at once: a buffer that grows is copied, and so is what ``join`` or ``+`` make of parts
+        out.seek(0)
+        out.write(header)
+        rows = max(1, _image.STRIP // grid.width)
+        for top in range(grid.height, 0, -rows):
+            out.write(grid.cells[max(0, top - rows) : top][::-1].tobytes().translate(table))
+        return out.getvalue()
     rule = _rule(grid.mode, grid.negate, grid.occupied_thresh, grid.free_thresh)
     if rule[pixels[UNKNOWN]] == UNKNOWN or not bool((grid.cells == UNKNOWN).any()):
         return _image.encode_png(grid.cells, flip=True, table=table)

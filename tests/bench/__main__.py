@@ -1,4 +1,4 @@
-"""Measure and print ratios: conversions to their floors, first GET to the bare conversion, GETs to a peer."""
+"""Measure and print: conversions to their floors, first GET to the bare conversion, GETs to a peer; large maps."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from app.convert import offline
 from app.formats import Limits
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
-from tests.bench import floors, http, networks
+from tests.bench import floors, http, large, networks
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/"
@@ -211,12 +211,21 @@ def farm_grid() -> OccupancyGrid:
     return grid
 
 
+def memory() -> list[dict[str, Any]]:
+    """Time and peak memory of large maps, each in a process of its own."""
+    rows = []
+    for name in large.CASES:
+        with tempfile.TemporaryDirectory() as folder:
+            rows.append(large.measure(name, Path(folder)))
+    return rows
+
+
 def main() -> int:
     """Print the tables (or JSON); exit status 1 where a bound does not hold."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
     parser.add_argument("--tries", type=int, default=7, help="counted runs of each conversion (default 7)")
     parser.add_argument("--json", action="store_true", help="machine-readable output")
-    parser.add_argument("--only", choices=["conversions", "serving", "networks"], help="one of the tables")
+    parser.add_argument("--only", choices=["conversions", "serving", "networks", "large"], help="one of the tables")
     arguments = parser.parse_args()
     if not DATA.is_dir():
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
@@ -224,8 +233,9 @@ def main() -> int:
     converted = conversions(arguments.tries) if arguments.only in (None, "conversions") else []
     served = serving(arguments.tries) if arguments.only in (None, "serving") else []
     derived = networks.rows(farm_grid(), arguments.tries) if arguments.only in (None, "networks") else []
+    big = memory() if arguments.only in (None, "large") else []
     if arguments.json:
-        print(json.dumps({"conversions": converted, "serving": served, "networks": derived}, indent=2))
+        print(json.dumps({"conversions": converted, "serving": served, "networks": derived, "large": big}, indent=2))
     else:
         console = Console(width=110)
         if converted:
@@ -257,7 +267,20 @@ def main() -> int:
                     "yes" if r["holds"] else "NO",
                 )
             console.print(table)
-    return 0 if all(r["holds"] for r in [*converted, *served, *derived]) else 1
+        if big:
+            table = Table("large map", "input MB", "s", "peak MB", "peak ÷ input or pixels", "bound", "holds")
+            for r in big:
+                table.add_row(
+                    r["map"],
+                    f"{r['input_mb']:.1f}",
+                    f"{r['ms'] / 1e3:.2f}",
+                    f"{r['peak_mb']:.0f}",
+                    f"{r['times']:.1f}",
+                    f"≤ {r['bound']:.0f}" if r["bound"] else "–",
+                    "yes" if r["holds"] else "NO",
+                )
+            console.print(table)
+    return 0 if all(r["holds"] for r in [*converted, *served, *derived, *big]) else 1
 
 
 if __name__ == "__main__":

@@ -1,0 +1,18 @@
+"""The benchmark's large maps are maps: each converts, as a small one, and is the same from the same seed."""
+
+from __future__ import annotations
+
+import pytest
+
+from app.convert import offline
+from tests.bench.large import CASES, SMALL
+
+
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_a_made_up_map_converts(name: str) -> None:
+    case = CASES[name]
+    files = case.make(SMALL)
+    assert files == case.make(SMALL)
+    made = offline(files, case.to, datum=case.datum, options=case.options)
+    assert made.files
+    assert not [w for w in made.report["warnings"] if "left out" in w["problem"]]
