@@ -57,7 +57,7 @@ OBSTACLES: Mapping[str, float] = {
     **dict.fromkeys(("wall", "fence", "hedge", "barrier", "railing"), 0.1),
     **dict.fromkeys(("building", "obstacle", "furniture", "shelf", "rack", "table", "machine", "container"), 0.1),
     **dict.fromkeys(("pillar", "column", "bollard", "post", "pole", "rock", "stone", "crate", "box"), 0.3),
-    **dict.fromkeys(("tree", "trunk", "bush", "shrub", "plant"), 0.3),
+    **dict.fromkeys(("tree", "trunk", "bush", "shrub", "plant", "vegetation"), 0.3),
     **dict.fromkeys(("water", "pond", "ditch", "stream"), 1.0),
 }
 """Kinds that stand in the way, and how wide a line of that kind, or a point's disc, is where nothing says: metres.

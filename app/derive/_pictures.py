@@ -1,0 +1,170 @@
+"""Pictures for derivations: which one of a level is meant, and its pixels on a grid of the local frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.errors import Ambiguous, CannotConvert, Invalid, NotFound
+from app.model.frame import Datum
+from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
+from app.model.imagery import CLEAR, LOCAL, Picture, displayed
+from app.model.layers import Layers, PartKey
+from app.model.resampling import resampled
+
+SATELLITE = "satellite"
+"""The usual name of a picture."""
+
+STEPS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+"""Metres a pixel that are taken unless asked otherwise: the first that is no finer than the picture."""
+
+EASY = 2**21
+"""Pixels up to which that is kept."""
+
+MOST = 2**25
+"""Pixels that are looked at whatever was asked for."""
+
+OPAQUE = 128
+"""Alpha from which on there is a picture."""
+
+INFRARED = ("nir", "near infrared", "near-infrared", "near_infrared", "infrared")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """A picture on a grid of the local frame, row 0 on top, north up.
+
+    rgb: uint8 [h, w, 3]. known: bool [h, w], where there is a picture. resolution: metres a pixel. left, top: metres of
+    the upper left corner. raw: the resampled bands. frame: the local frame (a passing one, where the environment has no
+    datum). grey: whether the picture has no colours. on_earth: whether the picture is anchored there.
+    """
+
+    rgb: NDArray[np.uint8]
+    known: NDArray[np.bool_]
+    resolution: float
+    left: float
+    top: float
+    raw: NDArray[Any]
+    frame: LocalFrame | None
+    grey: bool
+    on_earth: bool
+
+    @property
+    def transform(self) -> tuple[float, float, float, float, float, float]:
+        """Of pixels to metres."""
+        return (self.resolution, 0.0, self.left, 0.0, -self.resolution, self.top)
+
+
+def chosen(layers: Layers, name: str | None) -> dict[PartKey, Picture]:
+    """One picture for each level: the named one, else ``satellite``, else the only one. NotFound, or Ambiguous."""
+    pictures = {key: part for key, part in layers.of("imagery").items() if isinstance(part, Picture)}
+    if name is not None:
+        found = {key: part for key, part in pictures.items() if key.name == name}
+        if not found:
+            there = ", ".join(sorted({key.name for key in pictures})) or "none"
+            raise NotFound(f"there is no picture {name!r}; there are: {there}")
+        return found
+    out = {}
+    for level in dict.fromkeys(key.level for key in pictures):
+        here = {key: part for key, part in pictures.items() if key.level == level}
+        usual = {key: part for key, part in here.items() if key.name == SATELLITE} or here
+        if len(usual) > 1:
+            there = ", ".join(key.name for key in usual)
+            raise Ambiguous(f"level {level!r} has several pictures ({there}): name one with picture=")
+        out.update(usual)
+    return out
+
+
+def called(key: PartKey) -> str:
+    """What messages call a picture."""
+    return f"the picture {key.name!r} of level {key.level!r}"
+
+
+def ground(picture: Picture, frame: LocalFrame | None, resolution: float | None, notes: Notes, name: str) -> Ground:
+    """A picture as the local frame sees it. frame: None uses a passing one at a picture's own place on earth.
+
+    Raises CannotConvert where it would be too large, Invalid where PROJ knows no way.
+    """
+    on_earth = picture.crs != LOCAL
+    if on_earth and frame is None:
+        frame = local_frame(_middle(picture))
+    size = _native(picture, frame)
+    if resolution is None:
+        resolution = next((step for step in STEPS if step >= size * 0.999), size)
+        for step in STEPS:
+            if step >= resolution and _count(picture, size, step) <= EASY:
+                resolution = step
+                break
+        if resolution > size * 2:
+            notes.fill(
+                "resolution", resolution, f"{name} is looked at in pixels of this size; a finer one can be given"
+            )
+    if _count(picture, size, resolution) > MOST:
+        raise CannotConvert(f"{name} would have more than {MOST} pixels of {resolution:g} m: give a coarser resolution")
+    try:
+        seen = resampled(picture, frame, crs=LOCAL, resolution=resolution, most_pixels=2 * MOST)
+    except Invalid as error:
+        raise CannotConvert(f"{name}: {error.detail}", error.problems) from error
+    shown = displayed(seen)
+    bands = shown.shape[2]
+    known = shown[..., -1] >= OPAQUE if bands in (2, 4) else np.ones(shown.shape[:2], bool)
+    grey = bands < 3
+    rgb = np.repeat(shown[..., :1], 3, axis=2) if grey else np.ascontiguousarray(shown[..., :3])
+    if not known.any():
+        raise CannotConvert(f"{name} shows nothing: all of it is transparent or without data")
+    _, _, left, _, _, top = seen.transform
+    return Ground(rgb, known, seen.transform[0], left, top, seen.pixels, frame, grey, on_earth)
+
+
+def infrared(picture: Picture, number: int | None, name: str) -> int | None:
+    """The place of the near-infrared band: the told one (counted from 1), else the one that says so."""
+    count = picture.pixels.shape[2]
+    if number is not None:
+        if number > count:
+            raise CannotConvert(f"{name} has {count} bands, and no band {number}: correct near_infrared")
+        if picture.colours[number - 1] in CLEAR:
+            raise CannotConvert(f"band {number} of {name} is its {picture.colours[number - 1]}: correct near_infrared")
+        return number - 1
+    said = picture.properties.get("bands")
+    for k, band in enumerate(said if isinstance(said, list | tuple) else ()):
+        if isinstance(band, Mapping):
+            words = [str(band.get(word, "")).strip().lower() for word in ("colour", "description")]
+            if any(word in INFRARED for word in words):
+                return k
+    return None
+
+
+def _middle(picture: Picture) -> Datum:
+    """The middle of a picture on earth."""
+    outline = picture.outline()
+    lonlat = crs_to_wgs84(picture.crs, np.column_stack([outline, np.zeros(len(outline))]))[:, :2].mean(axis=0)
+    if not np.isfinite(lonlat).all():
+        raise CannotConvert("the picture lies at no place on earth: correct its CRS or transform")
+    return Datum(round(float(lonlat[1]), 9), round(float(lonlat[0]), 9))
+
+
+def _native(picture: Picture, frame: LocalFrame | None) -> float:
+    """Metres a pixel of the picture itself, in its middle."""
+    if picture.crs == LOCAL or frame is None:
+        a, b, _, d, e, _ = picture.transform
+        return float(np.sqrt(abs(a * e - b * d)))
+    a, b, c, d, e, f = picture.transform
+    height, width = picture.pixels.shape[:2]
+    u, v = width / 2, height / 2
+    at = np.array([[u, v, 0.0], [u + 1, v, 0.0], [u, v + 1, 0.0]])
+    places = np.column_stack([a * at[:, 0] + b * at[:, 1] + c, d * at[:, 0] + e * at[:, 1] + f, at[:, 2]])
+    p, q, r = frame.to_local(crs_to_wgs84(picture.crs, places)[:, :2])
+    size = float(np.sqrt(abs((q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]))))
+    if not np.isfinite(size) or size <= 0.0:
+        raise CannotConvert("the picture is too far from the datum: correct one of the two")
+    return size
+
+
+def _count(picture: Picture, size: float, resolution: float) -> float:
+    height, width = picture.pixels.shape[:2]
+    return float(float(height) * width * (size / resolution) ** 2)

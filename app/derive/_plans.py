@@ -1,0 +1,231 @@
+"""A floor plan -> walls, rooms and what is outside.
+
+Ink is what is darker than Otsu's threshold between ink and paper. A room is what cannot be reached from the edge of the
+picture without crossing ink or a gap narrower than ``gap`` (doors, dashed lines). A shade between ink and paper that
+fills much of the picture evenly is no room either: the grey of ROS maps means unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.derive._raster import Frame, limited
+from app.errors import CannotConvert
+from app.model.frame import MAX_METRES
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.imagery import Picture, displayed, placed
+
+RESOLUTION = 0.05
+"""Metres a cell unless asked otherwise or the picture is coarser."""
+
+MOST = 2**28
+LONGEST = 32767
+
+SAME = 24
+"""Levels of grey by which ink and paper must differ."""
+
+SHADE = 0.02
+"""Share of the picture from which on an even shade between ink and paper is no room."""
+
+REACH = 1.0
+"""Metres from a room beyond which ink is no wall but a title, a scale or a measure."""
+
+ROOM = 1.0
+"""Square metres of the smallest room; what else ink encloses are letters, pillars and hollow walls."""
+
+COLOURFUL, CHROMA = 0.05, 40
+PAPER = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What a plan is made with. gap, speck: metres and square metres. outside: whether that is free."""
+
+    gap: float
+    speck: float
+    resolution: float | None
+    outside_free: bool
+
+
+def looks_like(rgb: NDArray[np.uint8], known: NDArray[np.bool_]) -> bool:
+    """Whether a picture is ink on paper: hardly any colour, and one bright shade on much of it."""
+    if not known.any():
+        return False
+    pixels = rgb[known]
+    chroma = pixels.max(axis=1).astype(np.int16) - pixels.min(axis=1)
+    if float((chroma > CHROMA).mean()) > COLOURFUL:
+        return False
+    grey = pixels.max(axis=1)
+    counts = np.bincount(grey, minlength=256)
+    around = np.convolve(counts, np.ones(17, np.int64), "same")
+    # Ink, too: a bright field with nothing darker in it is no plan.
+    return bool(around[180:].max() >= PAPER * len(grey)) and bool((grey < 128).any())
+
+
+def grey_of(picture: Picture) -> NDArray[np.uint8]:
+    """The picture in grey on white paper: uint8 [h, w]."""
+    shown = displayed(picture)
+    rgb = shown[..., :3] if shown.shape[2] >= 3 else shown[..., :1]
+    grey = rgb[..., 0] if rgb.shape[2] == 1 else _luma(rgb)
+    if shown.shape[2] in (2, 4):
+        alpha = shown[..., -1].astype(np.uint16)
+        grey = ((grey.astype(np.uint16) * alpha + 255 * (255 - alpha)) // 255).astype(np.uint8)
+    return np.ascontiguousarray(grey)
+
+
+def _luma(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    import cv2
+
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def grid_of(picture: Picture, how: Plan, notes: Notes, name: str) -> OccupancyGrid:
+    """A plan in the local frame as a grid: ink occupied, rooms free, else unknown. Its origin is a multiple of a cell.
+
+    Raises CannotConvert for a picture without ink or without a closed room.
+    """
+    import cv2
+
+    grey = grey_of(picture)
+    threshold, _ = cv2.threshold(grey, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    level = int(threshold)
+    ink = grey <= level
+    if ink.all() or not ink.any() or int(grey[~ink].mean()) - int(grey[ink].mean()) < SAME:
+        raise CannotConvert(f"{name} is of one shade: there is no ink on paper in it. Ask with another segmentation")
+    if ink.mean() > 0.5:
+        raise CannotConvert(f"{name} is dark all over, and no plan on bright paper. Ask with another segmentation")
+    unknown = _shades(grey, level, notes, name)
+    a, b, _, d, e, _ = picture.transform
+    size = math.sqrt(abs(a * e - b * d))
+    resolution = how.resolution or max(RESOLUTION, float(f"{size:.6g}"))
+    corners = picture.outline()
+    if not np.abs(corners).max() <= MAX_METRES:
+        raise CannotConvert(f"{name} reaches beyond the local frame")
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    frame = limited(
+        Frame.around((float(low[0]), float(low[1]), float(high[0]), float(high[1])), resolution), MOST, LONGEST
+    )
+    walls = _walls(ink, picture, frame, size)
+    paper, shaded = _looked_up(~unknown, picture, frame)
+    walls, specks = _without_specks(walls, how.speck / resolution**2)
+    notes.drop("marks", specks, f"{name}: ink of less than {how.speck:g} m² is dirt or writing")
+    outside = _outside(walls, how.gap / 2 / resolution)
+    inside = _rooms(~outside & (walls == 0) & paper & ~shaded, ROOM / resolution**2)
+    if not inside.any() and not how.outside_free:
+        raise CannotConvert(
+            f"{name} encloses no room: its walls have openings wider than gap={how.gap:g} m. Give a wider gap, or "
+            "outside_free=true where all that is no wall is free"
+        )
+    cells = np.full(walls.shape, UNKNOWN, np.uint8)
+    if how.outside_free:
+        cells[paper & ~shaded] = FREE
+    cells[inside] = FREE
+    near = walls == 1
+    if inside.any() and not how.outside_free:
+        away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        far = near & (away > REACH / resolution)
+        notes.drop("cells of ink", int(far.sum()), f"{name}: more than {REACH:g} m from any room")
+        near &= ~far
+    cells[near] = OCCUPIED
+    return OccupancyGrid(cells, resolution, (*frame.origin, 0.0))
+
+
+def _shades(grey: NDArray[np.uint8], level: int, notes: Notes, name: str) -> NDArray[np.bool_]:
+    """Pixels of even shades between ink and paper."""
+    counts = np.bincount(grey.ravel(), minlength=256)
+    paper = int(np.argmax(counts[level + 1 :])) + level + 1
+    brightest = int(np.flatnonzero(counts > 0.05 * grey.size)[-1]) if (counts > 0.05 * grey.size).any() else paper
+    shades = [k for k in range(level + 1, max(paper, brightest) - SAME) if counts[k] >= SHADE * grey.size]
+    if not shades:
+        return np.zeros(grey.shape, bool)
+    told = ", ".join(map(str, shades))
+    notes.warn(f"{name}: the even grey {told} is taken as unknown, as in the maps of ROS", where="imagery")
+    return np.asarray(np.isin(grey, shades))
+
+
+def _walls(ink: NDArray[np.bool_], picture: Picture, frame: Frame, size: float) -> NDArray[np.uint8]:
+    """Cells with ink, uint8 [rows, columns], row 0 lowest: every pixel of ink marks the cell of its middle, and every
+    cell whose middle is ink is marked, so that no line is lost whichever of the two is finer."""
+    walls = np.zeros((frame.height, frame.width), np.uint8)
+    if size <= frame.resolution * 1.5:
+        rows, columns = np.nonzero(ink)
+        for k in range(0, len(rows), 2**20):
+            u, v = (np.asarray(n[k : k + 2**20], np.float64) + 0.5 for n in (columns, rows))
+            at = placed(picture.transform, u, v)
+            x, y = np.floor(frame.of(at)).astype(np.int64).T
+            walls[np.clip(y, 0, frame.height - 1), np.clip(x, 0, frame.width - 1)] = 1
+    _, there = _looked_up(~ink, picture, frame)
+    walls[there] = 1
+    return walls
+
+
+def _looked_up(
+    bright: NDArray[np.bool_], picture: Picture, frame: Frame
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(cells whose middle is in the picture, those of them where it is not bright)."""
+    a, b, c, d, e, f = picture.transform
+    det = a * e - b * d
+    height, width = bright.shape
+    inside = np.zeros((frame.height, frame.width), bool)
+    dark = np.zeros((frame.height, frame.width), bool)
+    x = frame.origin[0] + (np.arange(frame.width) + 0.5) * frame.resolution - c
+    strip = max(1, 2**20 // frame.width)
+    for start in range(0, frame.height, strip):
+        rows = np.arange(start, min(start + strip, frame.height))
+        y = (frame.origin[1] + (rows + 0.5) * frame.resolution - f)[:, None]
+        column = np.floor((e * x[None, :] - b * y) / det).astype(np.int64)
+        row = np.floor((a * y - d * x[None, :]) / det).astype(np.int64)
+        ok = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        inside[rows] = ok
+        dark[rows] = ok & ~bright[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return inside, dark
+
+
+def _without_specks(walls: NDArray[np.uint8], least: float) -> tuple[NDArray[np.uint8], int]:
+    """Without pieces of ink that cover fewer cells than that, and how many they were."""
+    import cv2
+
+    if least <= 1:
+        return walls, 0
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(walls, connectivity=8)
+    small = stats[:, cv2.CC_STAT_WIDTH].astype(np.int64) * stats[:, cv2.CC_STAT_HEIGHT] < least
+    small[0] = False
+    if not small.any():
+        return walls, 0
+    return np.where(small[labels], 0, walls).astype(np.uint8), int(small[1:].sum())
+
+
+def _rooms(inside: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
+    """Without pieces of fewer cells than that."""
+    import cv2
+
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8), connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] >= least
+    large[0] = False
+    return np.asarray(large[labels])
+
+
+def _outside(walls: NDArray[np.uint8], radius: float) -> NDArray[np.bool_]:
+    """What is reached from beyond the edge through openings of more than two radii (in cells)."""
+    import cv2
+
+    margin = math.ceil(radius) + 2
+    padded = np.pad(walls, margin)
+    away = cv2.distanceTransform((padded == 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    core = (away > radius).astype(np.uint8)
+    _, labels = cv2.connectedComponents(core, connectivity=4)
+    reached = ((labels == labels[0, 0]) & (core == 1)).astype(np.uint8)
+    # Back to the walls, and not through them.
+    open_ = (padded == 0).astype(np.uint8)
+    kernel = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    for _ in range(math.ceil(radius * 1.5)):
+        grown = cv2.dilate(reached, kernel) & open_
+        if (grown == reached).all():
+            break
+        reached = grown
+    return np.asarray(reached[margin:-margin, margin:-margin] == 1)

@@ -1,0 +1,50 @@
+"""What the two derivations of pictures share: the method, and carrying it out."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+from app.derive import Notes, _plans
+from app.derive._pictures import Ground, infrared
+from app.derive._segments import OWN, Segmentation, Segments, segments
+from app.errors import Invalid, Problem
+from app.model.geodesy import LocalFrame
+from app.model.grid import OccupancyGrid
+from app.model.imagery import LOCAL, Picture, displayed
+from app.model.resampling import resampled
+
+THUMB = 2**20
+"""Pixels by which it is told whether a picture is a plan."""
+
+
+def method_of(picture: Picture, how: Segmentation) -> str:
+    """The method, found out where it is ``auto``. Invalid for parameters that belong to another one."""
+    method: str = how.segmentation
+    if method == "auto":
+        step = max(1, round((picture.pixels.shape[0] * picture.pixels.shape[1] / THUMB) ** 0.5))
+        few = Picture(picture.pixels[::step, ::step].copy(), picture.transform, picture.crs, picture.properties)
+        shown = displayed(few)
+        bands = shown.shape[2]
+        known = shown[..., -1] >= 128 if bands in (2, 4) else shown[..., 0] >= 0
+        method = "plan" if _plans.looks_like(shown[..., : 1 if bands < 3 else 3], known) else "colour"
+        if how.near_infrared is not None:
+            method = "index"
+    changed = [f.name for f in fields(how) if getattr(how, f.name) != f.default]
+    wrong = [n for n in changed if method not in OWN.get(n, (method,))]
+    if wrong:
+        problems = [Problem(f"belongs to segmentation={OWN[n][0]}, not to {method}", where=n) for n in wrong]
+        raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
+    return method
+
+
+def seen(on: Ground, picture: Picture, how: Segmentation, method: str, notes: Notes, name: str) -> Segments:
+    """A picture told apart."""
+    nir = infrared(picture, how.near_infrared, name) if method == "index" else None
+    return segments(on, how, method, nir, notes, name)
+
+
+def plan_of(picture: Picture, frame: LocalFrame | None, how: Segmentation, notes: Notes, name: str) -> OccupancyGrid:
+    """A plan as a grid."""
+    upright = picture if picture.crs == LOCAL else resampled(picture, frame, crs=LOCAL)
+    speck = 0.05 if how.minimum_area is None else how.minimum_area
+    return _plans.grid_of(upright, _plans.Plan(how.gap, speck, how.resolution, how.outside_free), notes, name)

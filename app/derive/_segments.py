@@ -1,0 +1,431 @@
+"""A picture from above -> fields, trees, vegetation, paths, roads and buildings, without a model.
+
+Pixels are told by colour: k-means in CIELAB groups them (seeded, so that the same picture gives the same groups), the
+excess green of a group, (2g - r - b) of colours that add up to 1 (Woebbecke et al. 1995), says whether it grows; with
+``index`` every pixel is told by its own excess green, or by NDVI = (nir - red) / (nir + red) where there is a
+near-infrared band. What grows is wood where it is dark or rough and turf where it is bright and smooth: wood is cut
+into crowns at the saddles of its distance to the edge, round ones are trees; turf, and bare ground of that size, is
+fields, parted at edges (Canny). What does not grow is told by shape: long and narrow is a path, or a road where it is
+wide; compact, with straight edges and of one shade is a building. The rest, and shadow, is nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.derive._pictures import Ground
+from app.errors import CannotConvert
+from app.parameters import parameter
+
+Kind = Literal["field", "tree", "vegetation", "path", "road", "building"]
+Mask = NDArray[np.uint8]
+
+GREEN = 0.06
+"""Excess green from which on a group of pixels is vegetation."""
+
+NDVI = 0.2
+"""The least NDVI of vegetation, whatever Otsu's threshold says; sparse grass has about that."""
+
+SPREAD = 0.03
+"""Excess green, or NDVI, by which vegetation and the rest must differ at least."""
+
+DARK, SHADOW = 38.0, 20.0
+"""CIELAB lightness (0 to 100) below which vegetation is wood, and below which what is not green is shadow."""
+
+ROUGH = 2.5
+"""Mean difference of lightness from its median within 5 pixels, over ``WINDOW`` metres, from which on it is wood:
+a median follows edges, so a smooth tree on smooth turf has none."""
+
+WINDOW = 1.5
+CROWNS = (0.8, 20.0)
+"""Metres across a tree's crown, least and most."""
+
+ROUND = 0.75
+"""Share of its circle around the same middle that a tree's crown covers at least."""
+
+LONG = 4.0
+"""How many times as long as wide paths and roads are at least."""
+
+PATH, ROAD = 4.0, 20.0
+"""Metres: wider paths are roads, wider roads are none."""
+
+FIELD, TURF = 50.0, 10.0
+"""Square metres of bare ground, and of turf, that is a field, at least."""
+
+BUILDING, SIDE, RECTANGULAR = 8.0, 2.5, 0.78
+"""Least square metres, least metres of a side, and least share of its rectangle, of a building."""
+
+SAMPLE = 2**16
+"""Pixels by which the groups are found."""
+
+
+@dataclass(frozen=True, slots=True)
+class Segmentation:
+    """How a picture is told apart."""
+
+    segmentation: Literal["auto", "colour", "index", "plan"] = parameter(
+        "auto",
+        "colour: groups of like colour, then shape; index: vegetation by excess green, or NDVI with a near-infrared "
+        "band; plan: dark walls on bright paper; auto: plan for what looks like one, else colour",
+    )
+    picture: str | None = parameter(None, "which picture; default: satellite, else the only one of a level")
+    resolution: float | None = parameter(
+        None,
+        "metres a pixel, or a cell; default: the picture's, rounded up and at least 0.05, as much coarser as needed",
+        minimum=1e-3,
+        maximum=100.0,
+        unit="m",
+    )
+    clusters: int = parameter(8, "colour: how many groups of like colour", minimum=2, maximum=32)
+    cluster_seed: int = parameter(0, "colour: another number starts with other groups", minimum=0, maximum=2**31 - 1)
+    near_infrared: int | None = parameter(
+        None, "index: number of the near-infrared band, from 1; default: the one that says so", minimum=1, maximum=999
+    )
+    minimum_area: float | None = parameter(
+        None, "what is smaller is left out; default: 1 m², of a plan's ink 0.05 m²", minimum=0.0, maximum=1e6, unit="m²"
+    )
+    gap: float = parameter(
+        1.2, "plan: openings up to this wide do not make a room part of outside", minimum=0.0, maximum=20.0, unit="m"
+    )
+    outside_free: bool = parameter(False, "plan: whether what no wall encloses is free, too, and not unknown")
+
+
+OWN = {
+    "clusters": ("colour",),
+    "cluster_seed": ("colour",),
+    "near_infrared": ("index",),
+    "gap": ("plan",),
+    "outside_free": ("plan",),
+}
+"""Parameters that belong to some methods only."""
+
+
+@dataclass(slots=True)
+class Region:
+    """One thing. confidence: 0 to 1, how well its shape and shade fit its kind. said: what else is known of it."""
+
+    kind: Kind
+    confidence: float
+    said: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class Segments:
+    """label: int32 [h, w], 0 nothing, k the region k - 1. regions: in the order of their labels. open_: bool [h, w],
+    what is known to be no obstacle without being a region."""
+
+    label: NDArray[np.int32]
+    regions: list[Region]
+    open_: NDArray[np.bool_]
+
+
+def segments(ground: Ground, how: Segmentation, method: str, nir: int | None, notes: Notes, name: str) -> Segments:
+    """What a picture shows. nir: the place of the near-infrared band in ``ground.raw``.
+
+    Raises CannotConvert for a picture without colours, or of one.
+    """
+    import cv2
+
+    if ground.grey and nir is None:
+        raise CannotConvert(
+            f"{name} has no colours: what grows and what does not cannot be told. A floor plan is asked for with "
+            "segmentation=plan"
+        )
+    least = 1.0 if how.minimum_area is None else how.minimum_area
+    work = _Work(ground, least)
+    if method == "index":
+        grows = _by_index(ground, nir, notes, name)
+        work.vegetation(grows)
+        rest = ground.known & ~grows
+        work.small(notes, name)
+        return Segments(work.label, work.regions, rest | work.open_)
+    smooth = cv2.bilateralFilter(ground.rgb, 5, 25.0, 2.0)
+    lab = cv2.cvtColor(smooth.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)
+    group, centres = _groups(np.asarray(lab, np.float32), ground.known, how.clusters, how.cluster_seed)
+    if len(centres) < 2:
+        raise CannotConvert(f"{name} is of one colour: there is nothing to be told apart")
+    of = group[ground.known]
+    sums = np.stack([np.bincount(of, smooth[..., k][ground.known], len(centres)) for k in range(3)], axis=1)
+    means = sums / np.maximum(np.bincount(of, minlength=len(centres)), 1)[:, None]
+    green = (2 * means[:, 1] - means[:, 0] - means[:, 2]) / np.maximum(means.sum(axis=1), 1.0) > GREEN
+    dark = ~green & (centres[:, 0] < SHADOW)
+    grows = ground.known & green[group]
+    work.vegetation(grows)
+    for k in np.flatnonzero(~green & ~dark).tolist():
+        work.sealed(ground.known & (group == k))
+    shadow = ground.known & dark[group]
+    area = ground.resolution**2
+    notes.drop("m² of shadow", round(float(shadow.sum()) * area), f"{name}: too dark to tell what it is")
+    work.small(notes, name)
+    left = (work.label == 0) & ground.known & ~shadow & ~work.open_
+    notes.drop("m² of ground", round(float(left.sum()) * area), f"{name}: of no shape or colour that is known")
+    return Segments(work.label, work.regions, work.open_)
+
+
+def _by_index(ground: Ground, nir: int | None, notes: Notes, name: str) -> NDArray[np.bool_]:
+    """Where vegetation is."""
+    import cv2
+
+    if nir is None:
+        rgb = ground.rgb.astype(np.float32)
+        total = np.maximum(rgb.sum(axis=2), 1.0)
+        index, least = (2 * rgb[..., 1] - rgb[..., 0] - rgb[..., 2]) / total, GREEN
+    else:
+        infrared, red = ground.raw[..., nir].astype(np.float64), _red(ground)
+        total = infrared + red
+        index = np.divide(infrared - red, total, out=np.zeros(total.shape), where=total > 0).astype(np.float32)
+        least = NDVI
+    index = cv2.GaussianBlur(np.where(ground.known, index, np.float32(0)).astype(np.float32), (3, 3), 0)
+    known = index[ground.known]
+    low, high = float(known.min()), float(known.max())
+    if high < least:
+        raise CannotConvert(f"{name}: nothing in it grows, by its vegetation index of at most {high:.2f}")
+    threshold = least
+    if high - low > SPREAD:
+        scaled = np.round((known - low) / (high - low) * 255).astype(np.uint8)
+        cut, _ = cv2.threshold(scaled.reshape(-1, 1), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+        threshold = max(least, low + (cut + 0.5) / 255 * (high - low))
+    word = "excess green" if nir is None else "NDVI"
+    notes.fill("threshold", round(threshold, 4), f"{name}: what has a higher {word} is vegetation")
+    return np.asarray(ground.known & (index > threshold))
+
+
+def _red(ground: Ground) -> NDArray[np.float64]:
+    """Red as the bands have it, in the same unit as near infrared."""
+    return np.asarray(ground.raw[..., 0], np.float64)
+
+
+def _groups(
+    lab: NDArray[np.float32], known: NDArray[np.bool_], clusters: int, seed: int
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """(the group of each pixel, the colours [k, 3] of the groups from dark to bright) by k-means."""
+    import cv2
+
+    places = np.flatnonzero(known)
+    sample = lab.reshape(-1, 3)[places[:: max(1, len(places) // SAMPLE)]].astype(np.float32)
+    k = min(clusters, len(np.unique(np.round(sample), axis=0)))
+    if k < 2:
+        return np.zeros(known.shape, np.uint8), sample[:1]
+    cv2.setRNGSeed(seed)
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 0.2)
+    _, _, centres = cv2.kmeans(sample, k, None, stop, 3, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
+    centres = centres[np.lexsort(centres.T[::-1])]
+    out = np.empty(known.size, np.uint8)
+    flat = lab.reshape(-1, 3)
+    for start in range(0, len(flat), 2**18):
+        away = ((flat[start : start + 2**18, None, :] - centres[None]) ** 2).sum(axis=2)
+        out[start : start + 2**18] = away.argmin(axis=1)
+    return out.reshape(known.shape), centres
+
+
+class _Work:
+    """Regions as they are found."""
+
+    def __init__(self, ground: Ground, least: float) -> None:
+        import cv2
+
+        self.size = ground.resolution
+        self.least = max(least / self.size**2, 1.0)
+        self.height, self.width = (int(n) for n in ground.known.shape)
+        self.label = np.zeros(ground.known.shape, np.int32)
+        self.regions: list[Region] = []
+        self.lightness = cv2.cvtColor(ground.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[..., 0]
+        self.few = 0
+        self.known = ground.known
+        self.open_ = np.zeros(ground.known.shape, bool)
+
+    def pixels(self, metres: float) -> int:
+        """A length as an odd number of pixels, at least 3."""
+        return max(3, int(metres / self.size) // 2 * 2 + 1)
+
+    def small(self, notes: Notes, name: str) -> None:
+        """Say what was left out for its size."""
+        least = self.least * self.size**2
+        notes.drop("spots", self.few, f"{name}: smaller than minimum_area={least:g} m²")
+
+    def add(self, mask: NDArray[np.bool_], at: tuple[slice, slice], region: Region) -> None:
+        """A region: the mask within a window of the picture."""
+        self.regions.append(region)
+        window = self.label[at]
+        window[mask & (window == 0)] = len(self.regions)
+
+    def pieces(self, mask: NDArray[Any]) -> list[tuple[NDArray[np.bool_], tuple[slice, slice], int]]:
+        """The connected pieces that are large enough: (mask, window, area in pixels)."""
+        import cv2
+
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+        out = []
+        for k in range(1, count):
+            x, y, w, h, area = (int(v) for v in stats[k])
+            if area < self.least:
+                self.few += 1
+                continue
+            at = (slice(y, y + h), slice(x, x + w))
+            out.append((labels[at] == k, at, area))
+        return out
+
+    # --- what grows ---------------------------------------------------------------------------------------------------
+    def vegetation(self, grows: NDArray[np.bool_]) -> None:
+        """Wood and turf."""
+        import cv2
+
+        light = self.lightness
+        box = (self.pixels(WINDOW), self.pixels(WINDOW))
+        rough = cv2.blur(np.abs(light - cv2.medianBlur(light, 5)), box)
+        # The roughness of an edge to something else is none of the vegetation's own.
+        within = cv2.erode(grows.astype(np.uint8), np.ones(box, np.uint8)) == 1
+        wood = grows & ((cv2.blur(light, (3, 3)) < DARK) | (within & (rough > ROUGH)))
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
+        wood = grows & (cv2.morphologyEx(wood.astype(np.uint8), cv2.MORPH_CLOSE, kernel, iterations=2) == 1)
+        wood = cv2.morphologyEx(wood.astype(np.uint8), cv2.MORPH_OPEN, kernel) == 1
+        for mask, at, _ in self.pieces(wood):
+            self._wood(mask, at)
+        turf = cv2.morphologyEx((grows & ~wood).astype(np.uint8), cv2.MORPH_OPEN, kernel)
+        edges = cv2.Canny(cv2.GaussianBlur(np.clip(light * 2.55, 0, 255).astype(np.uint8), (5, 5), 0), 60, 150)
+        parted = turf & (cv2.dilate(edges, kernel) == 0)
+        for mask, at, area in self.pieces(parted):
+            # What the edge itself took is given back.
+            high, wide = (slice(max(0, s.start - 2), s.stop + 2) for s in at)
+            grown = np.pad(mask, ((at[0].start - high.start, 2), (at[1].start - wide.start, 2)))
+            room = turf[high, wide] == 1
+            grown = grown[: room.shape[0], : room.shape[1]]
+            grown = (cv2.dilate(grown.astype(np.uint8), kernel, iterations=2) == 1) & room
+            if self.metres(area) < TURF:
+                self.open_[high, wide] |= grown
+                continue
+            shade = float(light[high, wide][grown].std())
+            said = {"surface": "green", "area": self.metres(area)}
+            self.add(grown, (high, wide), Region("field", _fit(1.0 - shade / 30.0), said))
+
+    def metres(self, area: float) -> float:
+        """Pixels as square metres, to be told."""
+        return round(area * self.size**2, 2)
+
+    def _wood(self, mask: NDArray[np.bool_], at: tuple[slice, slice]) -> None:
+        """A piece of wood: crowns where it falls into round ones, else vegetation."""
+        import cv2
+        from scipy.ndimage import find_objects  # type: ignore[import-untyped]
+
+        padded = np.pad(mask, 1).astype(np.uint8)
+        away = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_5)
+        crowns = _watershed(padded, np.asarray(away, np.float32), self.pixels(CROWNS[0]))
+        rest = np.zeros(mask.shape, bool)
+        crowns = crowns[1:-1, 1:-1]
+        for k, inner in enumerate(find_objects(crowns), 1):
+            if inner is None:
+                continue
+            crown = crowns[inner] == k
+            size = int(crown.sum())
+            round_ = _roundness(crown)
+            across = 2 * math.sqrt(size / math.pi) * self.size
+            if size >= self.least and round_ >= ROUND and CROWNS[0] <= across <= CROWNS[1]:
+                said = {"area": self.metres(size), "width": round(across, 2)}
+                self.add(crown, _inner(at, inner), Region("tree", _fit(round_), said))
+            else:
+                rest[inner] |= crown
+        window = self.label[at]
+        for part, inner, size in self.pieces(rest & (window == 0)):
+            self.add(part, _inner(at, inner), Region("vegetation", 0.6, {"area": self.metres(size)}))
+
+    # --- what does not ------------------------------------------------------------------------------------------------
+    def sealed(self, mask: NDArray[np.bool_]) -> None:
+        """Ground and roofs of one group of colours."""
+        import cv2
+
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
+        clean = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel)
+        clean = cv2.morphologyEx(clean, cv2.MORPH_CLOSE, kernel, iterations=2)
+        clean[(self.label > 0) | ~self.known] = 0
+        for piece, at, area in self.pieces(clean):
+            self._by_shape(piece, at, area)
+
+    def _by_shape(self, piece: NDArray[np.bool_], at: tuple[slice, slice], area: int) -> None:
+        import cv2
+
+        # Without dents and holes of a pixel or two, which would make every outline long.
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+        plain = cv2.morphologyEx(np.pad(piece, 4).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+        outlines, order = cv2.findContours(plain, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        large = [c for c, o in zip(outlines, order[0], strict=True) if o[3] < 0 or cv2.contourArea(c) >= self.least]
+        around = sum(cv2.arcLength(cv2.approxPolyDP(c, 2.0, True), True) for c in large) + 4 * len(large)
+        outer = max(outlines, key=cv2.contourArea)
+        (_, _), (w, h), _ = cv2.minAreaRect(outer)
+        w, h = w + 1, h + 1
+        filled = cv2.contourArea(outer) + cv2.arcLength(outer, True) / 2 + 1
+        rectangular = min(1.0, filled / (w * h))
+        # Length and width of the band with this area and this way around it.
+        length = (around + math.sqrt(max(around * around - 16 * area, 0.0))) / 4
+        width = area / length
+        shade = float(self.lightness[at][piece].std())
+        uniform = max(0.0, 1.0 - shade / 25.0)
+        said: dict[str, Any] = {"area": self.metres(area)}
+        metres, side = width * self.size, min(w, h) * self.size
+        long = length >= LONG * width and metres <= ROAD and length * self.size >= 2 * WINDOW
+        ends = at[0].start == 0 or at[1].start == 0 or at[0].stop == self.height
+        ends = ends or at[1].stop == self.width
+        straight = rectangular >= RECTANGULAR and self.metres(area) >= BUILDING and side >= SIDE
+        # A way leads somewhere: a straight band that lies alone in the picture is rather a roof.
+        if straight and (max(w, h) < LONG * min(w, h) or (not ends and max(w, h) < 3 * LONG * min(w, h))):
+            sides = sorted((round(w * self.size, 2), round(h * self.size, 2)), reverse=True)
+            self.add(piece, at, Region("building", _fit(rectangular * uniform), {**said, "sides": sides}))
+        elif long:
+            slender = 1.0 - LONG / 2 / max(length / width, LONG)
+            kind: Kind = "path" if metres <= PATH else "road"
+            self.add(piece, at, Region(kind, _fit(slender * uniform), {**said, "width": round(metres, 2)}))
+        elif self.metres(area) >= FIELD:
+            self.add(piece, at, Region("field", _fit(0.6 * uniform), {**said, "surface": "bare"}))
+
+
+def _inner(at: tuple[slice, slice], inner: tuple[slice, slice]) -> tuple[slice, slice]:
+    """A window within a window, as one of the picture."""
+    rows, columns = (slice(o.start + i.start, o.start + i.stop) for o, i in zip(at, inner, strict=True))
+    return rows, columns
+
+
+def _fit(value: float) -> float:
+    return round(min(1.0, max(0.05, value)), 3)
+
+
+def _roundness(mask: NDArray[np.bool_]) -> float:
+    """Share of a shape that lies in the circle of its own area around its middle."""
+    rows, columns = np.nonzero(mask)
+    limit = len(rows) / math.pi
+    inside = (rows - rows.mean()) ** 2 + (columns - columns.mean()) ** 2 <= limit
+    return float(inside.mean())
+
+
+def _watershed(mask: Mask, away: NDArray[np.float32], window: int) -> NDArray[np.int32]:
+    """A mask cut at the saddles of its distance to the edge: int32 [h, w], 0 outside."""
+    import cv2
+
+    smooth = np.where(mask == 1, cv2.GaussianBlur(away, (window, window), 0), np.float32(0))
+    count, hills = cv2.connectedComponents(_hills(smooth).astype(np.uint8))
+    if count <= 2:
+        return mask.astype(np.int32)
+    markers: NDArray[np.int32] = hills.astype(np.int32) + 1
+    markers[(mask == 1) & (markers == 1)] = 0
+    height = np.clip(255.0 - smooth / max(float(smooth.max()), 1e-6) * 254.0, 0, 255).astype(np.uint8)
+    cv2.watershed(np.repeat(height[..., None], 3, axis=2), markers)
+    parts = np.where(markers > 1, markers - 1, 0)
+    # The lines between two basins go to one of them.
+    beside = cv2.dilate(parts.astype(np.float32), np.ones((3, 3), np.uint8)).astype(np.int32)
+    return np.where(mask == 1, np.where(parts > 0, parts, beside), 0).astype(np.int32)
+
+
+def _hills(height: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """The tops of the hills that rise more than a fifth above their saddles (domes by reconstruction)."""
+    import cv2
+
+    kernel = np.ones((3, 3), np.uint8)
+    marker = height * np.float32(0.8)
+    while True:
+        grown = np.minimum(cv2.dilate(marker, kernel), height)
+        if np.array_equal(grown, marker):
+            return np.asarray(height > marker + np.float32(1e-3))
+        marker = grown

@@ -1,0 +1,148 @@
+"""Imagery -> objects: what a picture from above, or a floor plan, shows, as polygons; paths with their middle lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import Notes, derives
+from app.derive._pictures import Ground, called, chosen, ground
+from app.derive._seen import method_of, plan_of, seen
+from app.derive._segments import Segmentation, Segments
+from app.errors import CannotConvert
+from app.model.features import features
+from app.model.grid import FREE, OCCUPIED, OccupancyGrid
+from app.model.layers import Layers, Part, PartKey
+from app.parameters import parameter
+
+NAME = "imagery"
+"""The family under which these objects stand."""
+
+Row = tuple[str, Any, dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters(Segmentation):
+    """How a picture becomes objects."""
+
+    outline_tolerance: float | None = parameter(
+        None, "how far outlines may be from the pixels'; default: one pixel", minimum=0.0, maximum=100.0, unit="m"
+    )
+
+
+@derives(gives="objects", needs={"imagery"}, parameters=Parameters, cost=30.0)
+def imagery_to_objects(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+    """What a picture shows as objects: fields, trees, vegetation, paths, roads, buildings; of a plan walls and floors.
+
+    Polygons with a ``confidence`` of 0 to 1, told by shape and shade; a path or road also has its middle line, of kind
+    ``path`` with a ``width``, which objects_to_topology makes a network of. They are anchored as the picture is. Raises
+    CannotConvert where nothing can be told.
+    """
+    parts: dict[PartKey, Part] = {}
+    for key, picture in chosen(layers, parameters.picture).items():
+        name = called(key)
+        method = method_of(picture, parameters)
+        if method == "plan":
+            grid = plan_of(picture, layers.frame, parameters, notes, name)
+            on, rows = None, _plan(grid, parameters)
+        else:
+            on = ground(picture, layers.frame, parameters.resolution, notes, name)
+            rows = _regions(seen(on, picture, parameters, method, notes, name), on, parameters)
+        if not rows:
+            raise CannotConvert(f"{name} shows nothing that can be told: try other clusters, or another segmentation")
+        if on is not None and on.on_earth and on.frame is not None:
+            geometry = np.array([g for _, g, _ in rows], object)
+            back = shapely.set_precision(on.frame.geometries_to_wgs84(geometry), 1e-12, mode="pointwise")
+            rows = [(i, g, said) for (i, _, said), g in zip(rows, back, strict=True)]
+        notes.warn("the objects are guessed from a picture: look at them before a robot goes by them", where=key.name)
+        made = features(rows, "wgs84" if on is not None and on.on_earth else "local")
+        parts[PartKey("objects", key.level, NAME)] = made
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def _regions(found: Segments, on: Ground, parameters: Parameters) -> list[Row]:
+    """Each region as a polygon, then the middle lines of paths and roads, in the local frame."""
+    tolerance = on.resolution if parameters.outline_tolerance is None else parameters.outline_tolerance
+    shapes = _polygons(found.label, on.transform, tolerance)
+    rows: list[Row] = []
+    for k, region in enumerate(found.regions, 1):
+        if k in shapes:
+            said = {"kind": region.kind, "confidence": region.confidence, **region.said}
+            rows.append((f"{region.kind}/{k}", shapes[k], said))
+    rows += _middles(found, on)
+    return rows
+
+
+def _polygons(label: NDArray[np.int32], transform: Any, tolerance: float) -> dict[int, Any]:
+    """The area of each label, simplified, in metres."""
+    from rasterio.features import shapes  # type: ignore[import-untyped]
+    from rasterio.transform import Affine  # type: ignore[import-untyped]
+
+    found: dict[int, list[Any]] = {}
+    for geometry, value in shapes(label, mask=label > 0, connectivity=4, transform=Affine(*transform)):
+        rings = geometry["coordinates"]
+        found.setdefault(int(value), []).append(shapely.Polygon(rings[0], rings[1:]))
+    out = {}
+    for value, areas in found.items():
+        area = areas[0] if len(areas) == 1 else shapely.MultiPolygon(areas)
+        if tolerance > 0:
+            area = shapely.simplify(area, tolerance, preserve_topology=True)
+        area = shapely.set_precision(shapely.make_valid(area), 1e-9, mode="pointwise")
+        if area.area > 0:
+            out[value] = area
+    return out
+
+
+def _middles(found: Segments, on: Ground) -> list[Row]:
+    """The middle lines of paths and roads, joined where these meet."""
+    from app.derive import _kernels_space, _skeleton
+
+    ways = [k for k, region in enumerate(found.regions, 1) if region.kind in ("path", "road")]
+    if not ways:
+        return []
+    mask = np.pad(np.isin(found.label, ways), 1).astype(np.uint8)
+    where = _skeleton.space(mask, -1, -1, 0.0)
+    widths = [float(found.regions[k - 1].said["width"]) for k in ways]
+    usual = float(np.median(widths)) / on.resolution
+    graph, _ = _skeleton.skeleton(where, merge=max(2.0, usual / 2), spur=usual, tolerance=1.0, island=0.0)
+    if not len(graph.edges):
+        return []
+    wide = np.empty(len(graph.edges))
+    _kernels_space.widths(where.gap, graph.nodes, graph.edges, wide)
+    at = np.empty((len(graph.nodes), 2))
+    at[:, 0] = on.left + (graph.nodes[:, 1] - 0.5) * on.resolution
+    at[:, 1] = on.top - (graph.nodes[:, 0] - 0.5) * on.resolution
+    at = np.round(at, 9) + 0.0
+    lines = shapely.get_parts(shapely.line_merge(shapely.multilinestrings(shapely.linestrings(at[graph.edges]))))
+    lines = lines[np.lexsort(shapely.bounds(lines).T[::-1])]
+    narrow = {(float(x), float(y)): np.inf for x, y in at}
+    for (a, b), w in zip(graph.edges.tolist(), wide.tolist(), strict=True):
+        for n in (a, b):
+            place = (float(at[n, 0]), float(at[n, 1]))
+            narrow[place] = min(narrow[place], w)
+    rows: list[Row] = []
+    for k, line in enumerate(lines):
+        width = min(narrow[(float(x), float(y))] for x, y in shapely.get_coordinates(line))
+        said = {"kind": "path", "width": round(width * on.resolution, 3), "middle_line": True}
+        rows.append((f"middle/{k}", line, said))
+    return rows
+
+
+def _plan(grid: OccupancyGrid, parameters: Parameters) -> list[Row]:
+    """The walls and the floors of a plan's grid."""
+    x, y, _ = grid.origin
+    r = grid.resolution
+    tolerance = r / 2 if parameters.outline_tolerance is None else parameters.outline_tolerance
+    rows: list[Row] = []
+    for kind, value in (("wall", OCCUPIED), ("floor", FREE)):
+        import cv2
+
+        connectivity = 4
+        _, label = cv2.connectedComponents((grid.cells == value).astype(np.uint8), connectivity=connectivity)
+        for k, area in sorted(_polygons(label.astype(np.int32), (r, 0.0, x, 0.0, r, y), tolerance).items()):
+            rows.append((f"{kind}/{k}", area, {"kind": kind}))
+    return rows

@@ -1,0 +1,57 @@
+"""Imagery -> occupancy: a picture from above, or a floor plan, as a grid to plan on where there is no better map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.derive import Notes, derives
+from app.derive._pictures import called, chosen, ground
+from app.derive._seen import method_of, plan_of, seen
+from app.derive._segments import Segmentation
+from app.errors import CannotConvert, MissingDatum
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.imagery import LOCAL
+from app.model.layers import MAP, Layers, Part, PartKey
+
+OBSTACLES = frozenset({"tree", "vegetation", "building"})
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters(Segmentation):
+    """How a picture becomes a grid."""
+
+
+@derives(gives="occupancy", needs={"imagery"}, parameters=Parameters, cost=30.0)
+def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+    """A picture as an occupancy grid: trees, vegetation, buildings and walls are occupied.
+
+    Fields, paths, roads and a plan's rooms are free, everything else is unknown. The origin is a whole multiple of the
+    resolution, yaw 0. Raises CannotConvert where the picture shows nothing that can be told, MissingDatum where it lies
+    on earth and there is no datum.
+    """
+    parts: dict[PartKey, Part] = {}
+    for key, picture in chosen(layers, parameters.picture).items():
+        name = called(key)
+        if picture.crs != LOCAL and layers.frame is None:
+            raise MissingDatum('a grid lies in local metres: PATCH the environment with {"datum": {…}}')
+        method = method_of(picture, parameters)
+        if method == "plan":
+            grid = plan_of(picture, layers.frame, parameters, notes, name)
+        else:
+            on = ground(picture, layers.frame, parameters.resolution, notes, name)
+            found = seen(on, picture, parameters, method, notes, name)
+            cells = np.full(found.label.shape, UNKNOWN, np.uint8)
+            cells[found.open_] = FREE
+            values = np.array([UNKNOWN, *(OCCUPIED if r.kind in OBSTACLES else FREE for r in found.regions)], np.uint8)
+            there = found.label > 0
+            cells[there] = values[found.label[there]]
+            bottom = on.top - on.resolution * len(cells)
+            origin = (round(on.left, 9), round(bottom, 9), 0.0)
+            grid = OccupancyGrid(np.ascontiguousarray(cells[::-1]), on.resolution, origin)
+        if not (grid.cells == FREE).any():
+            raise CannotConvert(f"{name} shows nothing that is free: no field, path, road or room is told in it")
+        notes.warn("the grid is guessed from a picture: look at it before a robot drives by it", where=key.name)
+        parts[PartKey("occupancy", key.level, MAP)] = grid
+    return Layers(parts, layers.datum, layers.levels)

@@ -1,0 +1,98 @@
+"""Floor plans that a building names -> imagery, so that a plan alone, before any wall is drawn, is a map."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes, derives
+from app.errors import MissingLayer
+from app.model.imagery import Picture
+from app.model.layers import Layers, Part, PartKey
+
+MOST_PIXELS = 2**26
+KINDS = ("PNG", "JPEG", "BMP")
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """It has none: the building says where its drawings lie."""
+
+
+@derives(gives="imagery", needs={"resources", "objects"}, parameters=Parameters, cost=15.0)
+def resources_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:  # noqa: ARG001
+    """The floor plans of an Open-RMF building as pictures in the local frame.
+
+    They lie where the building's measurements and fiducials put them. Raises MissingLayer where no building names a
+    drawing that was uploaded and can be read.
+    """
+    files = layers.resources()
+    parts: dict[PartKey, Part] = {}
+    for level, name, turn in _drawings(layers):
+        if name not in files:
+            notes.warn(f"the drawing {name[:200]!r} was not uploaded", where=level)
+            continue
+        pixels = _pixels(files[name], name, level, notes)
+        if pixels is None:
+            continue
+        scale, rotation, x, y = turn
+        if scale == 1.0:
+            notes.warn("the building has no measurement: a pixel of its drawing counts as a metre", where=level)
+        c, s = scale * math.cos(rotation), scale * math.sin(rotation)
+        # A building's pixels point downward, and are turned with y up.
+        picture = Picture(pixels, (c, s, x, s, -c, y))
+        parts[PartKey("imagery", level, name.rpartition("/")[2].rpartition(".")[0] or "plan")] = picture
+    if not parts:
+        raise MissingLayer(
+            "no building names a floor plan that was uploaded: upload building.yaml with its images, or a picture with "
+            "a world file, corners or metres_per_pixel"
+        )
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def _drawings(layers: Layers) -> Iterator[tuple[str, str, tuple[float, float, float, float]]]:
+    """(level, file, [scale, rotation, x, y]) as a building's documents tell them."""
+    for key, part in layers.vector("objects").items():
+        said = part.document.get("openrmf")
+        if not isinstance(said, Mapping):
+            continue
+        level, turn = said.get("level"), said.get("transform")
+        drawing = level.get("drawing") if isinstance(level, Mapping) else None
+        name = drawing.get("filename") if isinstance(drawing, Mapping) else None
+        if isinstance(name, str) and name and isinstance(turn, list | tuple) and len(turn) == 4:
+            scale, rotation, x, y = (float(v) for v in turn)
+            if scale > 0 and all(map(math.isfinite, (scale, rotation, x, y))):
+                yield key.level, _found(name, layers.resources()), (scale, rotation, x, y)
+
+
+def _found(said: str, files: Mapping[str, bytes]) -> str:
+    """The stored file that a drawing's name means: itself, else the first of that base name."""
+    base = said.replace("\\", "/").rpartition("/")[2]
+    return said if said in files else next((f for f in sorted(files) if f.rpartition("/")[2] == base), said)
+
+
+def _pixels(data: bytes, name: str, level: str, notes: Notes) -> NDArray[np.uint8] | None:
+    """A drawing's pixels, grey or RGB, with alpha where it has some; None, with a warning, where it is no picture."""
+    from PIL import Image
+
+    reason: Any = None
+    try:
+        with Image.open(io.BytesIO(data), formats=KINDS) as image:
+            if image.width * image.height > MOST_PIXELS:
+                reason = f"{image.width} × {image.height} pixels are too many: at most {MOST_PIXELS}"
+            else:
+                clear = "transparency" in image.info or "A" in image.getbands()
+                grey = image.mode in ("1", "L", "LA")
+                mode = ("LA" if clear else "L") if grey else ("RGBA" if clear else "RGB")
+                pixels = np.array(image.convert(mode), np.uint8)
+                return pixels[..., None] if pixels.ndim == 2 else pixels
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        reason = error
+    notes.warn(f"the drawing {name[:200]!r} cannot be read: {str(reason)[:200]}", where=level)
+    return None
