@@ -60,6 +60,7 @@ from app.errors import FleetMapError, Unavailable
 from app.events.bus import Bus, BusOptions
 from app.events.relay import Relay
 from app.fleet import Intake as FleetIntake
+from app.fleet import decide
 from app.ingest import Ingest
 from app.pool import Pool
 from app.sandbox import Allowed
@@ -315,7 +316,7 @@ def _first_token(store: Store, settings: Settings) -> None:
 
 
 async def _tick(here: Services) -> None:
-    """Planned moves of channels, signs of life of jobs, and the daily clean-up."""
+    """Planned moves and roll-outs of channels, signs of life of jobs, and the daily clean-up."""
     beat = 0.0
     collect = datetime.now(UTC) + COLLECT_EVERY
     while True:
@@ -324,6 +325,7 @@ async def _tick(here: Services) -> None:
         try:
             here.hot.count()
             await run_in_threadpool(here.store.apply_due, datetime.now(UTC))
+            await run_in_threadpool(here.store.advance_rollouts, datetime.now(UTC), decide)
             if beat >= BEAT_SECONDS:
                 beat = 0.0
                 await run_in_threadpool(here.work.beat)

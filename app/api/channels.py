@@ -15,7 +15,7 @@ from app.api.answers import Route, answer
 from app.api.schemas import ChannelBody, ChannelOut, ChannelPath, EnvironmentPath, told
 from app.api.services import Here, Services
 from app.errors import Invalid, Problem
-from app.store.values import LATEST, Channel, Robot, rfc3339
+from app.store.values import LATEST, Channel, Robot, Rollout, rfc3339
 
 router = APIRouter(prefix="/environments/{env}/channels", tags=["channels"], route_class=Route)
 
@@ -27,7 +27,7 @@ def as_dict(channel: Channel, robots: Sequence[Robot], now: datetime) -> dict[st
         planned = {
             "version": channel.planned.version,
             "root": channel.planned.root,
-            "activate_at": rfc3339(channel.planned.activate_at),
+            "activate_at": rfc3339(channel.planned.activate_at) if channel.planned.activate_at else None,
             "author": channel.planned.author,
         }
     return {
@@ -38,6 +38,7 @@ def as_dict(channel: Channel, robots: Sequence[Robot], now: datetime) -> dict[st
         "author": channel.author,
         "time": rfc3339(channel.time),
         "planned": planned,
+        "rollout": channel.rollout.as_dict() if channel.rollout else None,
         "robots": fleet.holding(robots, channel, now, channel.planned.root if channel.planned else None).as_dict(),
     }
 
@@ -59,7 +60,13 @@ def list_channels(env: EnvironmentPath, here: Here, _: Viewer) -> Response:
 
 @router.put("/{channel}", responses=told(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan it")
 def move_channel(env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, here: Here, who: Editor) -> Response:
-    """To a newer version or back to an older one, now or at a time to come. `latest` moves by itself."""
+    """To a newer version or back to an older one, now or at a time to come. `latest` moves by itself.
+
+    With `rollout` in two stages: robots are told (`channel.planned`), fetch the version and report `ready`; the channel
+    moves when the share `ready` of its online robots has it, and not before `activate_at`. When the share `failed`
+    reports `failed` before that, it does not move; within `window` seconds after it, it moves back, with a higher
+    sequence and `rollback: true`. By `deadline` the move is given up.
+    """
     if channel == LATEST:
         raise Invalid("latest moves by itself: choose another channel", [Problem("not to be moved", where="channel")])
     if body.activate_at is not None:
@@ -67,13 +74,40 @@ def move_channel(env: EnvironmentPath, channel: ChannelPath, body: ChannelBody, 
             raise _refused("activate_at needs a zone, like 2030-01-31T06:00:00Z")
         if body.activate_at <= datetime.now(UTC):
             raise _refused("activate_at is in the past: leave it out to move now")
+    rollout = _rollout(body) if body.rollout is not None else None
     version = here.store.version(env, body.version).number
-    moved = here.store.set_channel(env, channel, version, author=who.name, activate_at=body.activate_at)
+    moved = here.store.set_channel(
+        env, channel, version, author=who.name, activate_at=body.activate_at, rollout=rollout
+    )
     return answer(_one(here, env, moved))
 
 
-def _refused(detail: str) -> Invalid:
-    return Invalid(detail, [Problem(detail, where="body.activate_at")])
+def _rollout(body: ChannelBody) -> Rollout:
+    wish, now = body.rollout, datetime.now(UTC)
+    assert wish is not None
+    if wish.ready is None and wish.failed is None:
+        raise _refused("a rollout takes ready, failed, or both", "body.rollout")
+    if wish.deadline is not None:
+        where = "body.rollout.deadline"
+        if wish.ready is None:
+            raise _refused("deadline limits the waiting for robots: it needs ready", where)
+        if wish.deadline.tzinfo is None:
+            raise _refused("deadline needs a zone, like 2030-01-31T06:00:00Z", where)
+        if wish.deadline <= (body.activate_at or now):
+            raise _refused("deadline must lie in the future, and after activate_at", where)
+    return Rollout(
+        version=0,
+        root="",
+        started=now,
+        ready=wish.ready,
+        failed=wish.failed,
+        deadline=wish.deadline,
+        window=wish.window,
+    )
+
+
+def _refused(detail: str, where: str = "body.activate_at") -> Invalid:
+    return Invalid(detail, [Problem(detail, where=where)])
 
 
 @router.delete("/{channel}/planned", status_code=204, responses=told(None, 404), summary="Cancel what is planned")

@@ -218,15 +218,33 @@ class DerivationBody(In):
     replace: bool = Field(False, description="Whether what a source has told, or people have edited, gives way.")
 
 
+class RolloutBody(In):
+    """A move in two stages. At least one of ``ready`` and ``failed``."""
+
+    ready: float | None = Field(
+        None, gt=0, le=1, description="The channel moves when this share of its online robots has the version."
+    )
+    failed: float | None = Field(
+        None, gt=0, le=1, description="It does not move, or moves back, when this share of its robots reports `failed`."
+    )
+    deadline: Moment | None = Field(None, description="RFC 3339 time with zone: without enough robots it stays then.")
+    window: float = Field(600.0, ge=1, le=604_800, description="Seconds for which robots are watched after the move.")
+
+
 class ChannelBody(In):
     """Where a channel is to stand, and since when."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, json_schema_extra={"examples": [{"version": 1}]})
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={"examples": [{"version": 1}, {"version": 1, "rollout": {"ready": 0.9, "failed": 0.2}}]},
+    )
 
     version: int | str = Field(description="Number, channel or `latest`; kept as the number.")
     activate_at: Moment | None = Field(
         None, description="RFC 3339 time with zone at which the channel moves; left out: now."
     )
+    rollout: RolloutBody | None = Field(None, description="Let robots fetch it first, and watch them afterwards.")
 
 
 class StatusBody(In):
@@ -402,6 +420,23 @@ class ChannelRobotsOut(BaseModel):
     since: datetime | None
 
 
+class RolloutOut(BaseModel):
+    """The last roll-out of a channel. ``before``: the version that it moves back to; ``detail``: why it stands so."""
+
+    version: int
+    root: str
+    started: datetime
+    ready: float | None
+    failed: float | None
+    activate_at: datetime | None
+    deadline: datetime | None
+    window: float
+    state: Literal["waiting", "watching", "done", "expired", "failed", "rolled_back", "cancelled"]
+    before: int | None
+    moved: datetime | None
+    detail: str
+
+
 class ChannelOut(BaseModel):
     """A movable name for a version."""
 
@@ -412,6 +447,7 @@ class ChannelOut(BaseModel):
     author: str
     time: datetime
     planned: dict[str, Any] | None = None
+    rollout: RolloutOut | None = None
     robots: ChannelRobotsOut
 
 

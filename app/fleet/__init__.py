@@ -1,9 +1,11 @@
 """The fleet: who holds what, who is there, who lags.
 
-``picture`` what follows from what is stored · ``intake`` what comes over the bus, in order, into the store.
+``picture`` what follows from what is stored · ``rollout`` when channels move, and move back · ``intake`` what comes
+over the bus, in order, into the store.
 """
 
 from app.fleet.intake import Intake, report_of
 from app.fleet.picture import Holding, Lag, holding, is_online, lag_of
+from app.fleet.rollout import decide
 
-__all__ = ["Holding", "Intake", "Lag", "holding", "is_online", "lag_of", "report_of"]
+__all__ = ["Holding", "Intake", "Lag", "decide", "holding", "is_online", "lag_of", "report_of"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import datetime
 from typing import Any, Literal
 
@@ -11,7 +13,19 @@ from app.errors import Invalid, NotFound
 from app.store import outbox, tables
 from app.store.base import CHANNEL_NAME, Base, environment_row, text, utcnow
 from app.store.manifest import read_version
-from app.store.values import LATEST, Channel, Planned, Version, rfc3339
+from app.store.robots import robots_of
+from app.store.values import (
+    LATEST,
+    OPEN_ROLLOUTS,
+    Channel,
+    Planned,
+    Robot,
+    Rollout,
+    RolloutState,
+    Step,
+    Version,
+    rfc3339,
+)
 
 
 class Channels(Base):
@@ -66,22 +80,34 @@ class Channels(Base):
             return read_version(connection, row, number), int(sequence or 0)
 
     def set_channel(
-        self, environment: str, channel: str, version: int, *, author: str, activate_at: datetime | None = None
+        self,
+        environment: str,
+        channel: str,
+        version: int,
+        *,
+        author: str,
+        activate_at: datetime | None = None,
+        rollout: Rollout | None = None,
     ) -> Channel:
         """Move a channel to a version, or plan to (``activate_at``, an aware time); the plan of before is dropped.
 
         The event tells ``rollback: true`` where the version is lower than the channel's. Moving it to where it is
-        changes nothing. ``latest`` cannot be moved.
+        changes nothing. ``latest`` cannot be moved. rollout: in two stages; its version and root are set here. Whatever
+        roll-out was under way ends.
         """
         _check_name(channel)
         if activate_at is not None and activate_at.tzinfo is None:
             raise Invalid("activate_at needs a time zone, for example 2026-05-01T04:00:00Z")
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            if activate_at is None:
-                _move(connection, row, channel, version, text(author, "an author"), utcnow())
+            now, who = utcnow(), text(author, "an author")
+            if rollout is not None:
+                root = read_version(connection, row, version).root
+                rollout = replace(rollout, version=version, root=root, activate_at=activate_at, started=now)
+            if activate_at is None and (rollout is None or rollout.ready is None):
+                _move(connection, row, channel, version, who, now, rollout=rollout)
             else:
-                _plan(connection, row, channel, version, text(author, "an author"), activate_at)
+                _plan(connection, row, channel, version, who, activate_at, rollout)
             return _read(connection, row, channel)
 
     def cancel_planned(self, environment: str, channel: str, author: str) -> Channel:
@@ -98,6 +124,8 @@ class Channels(Base):
                 .where(table.c.environment_id == row.id, table.c.name == channel)
                 .values(planned_version=None, planned_at=None, planned_author=None)
             )
+            if known.rollout_state == "waiting":
+                _end(connection, row, known, "cancelled", "the plan was cancelled")
             return _read(connection, row, channel)
 
     def apply_due(self, now: datetime) -> list[tuple[str, Channel]]:
@@ -106,7 +134,8 @@ class Channels(Base):
         query = (
             select(owner.c.name.label("environment"), table.c.name)
             .join(owner, owner.c.id == table.c.environment_id)
-            .where(table.c.planned_at <= now, owner.c.deleted.is_(None))
+            .where(table.c.planned_at <= now, table.c.rollout_state.is_distinct_from("waiting"))
+            .where(owner.c.deleted.is_(None))
             .order_by(table.c.planned_at, owner.c.name, table.c.name)
         )
         with self._database.read() as connection:
@@ -116,11 +145,81 @@ class Channels(Base):
             with self._database.write() as connection:
                 row = environment_row(connection, environment, lock=True)
                 known = _row(connection, row, name)
-                if known is None or known.planned_version is None or known.planned_at > now:
+                if known is None or known.planned_at is None or known.planned_at > now:
+                    continue
+                if known.rollout_state == "waiting":
                     continue
                 _move(connection, row, name, known.planned_version, known.planned_author or "", now)
                 out.append((environment, _read(connection, row, name)))
         return out
+
+    def advance_rollouts(self, now: datetime, decide: Decide) -> list[tuple[str, Channel]]:
+        """Let every open roll-out take its next step, each in its own transaction: (environment, channel) that did.
+
+        decide: what to do with a roll-out, given the robots of its channel. It is asked again inside of the
+        transaction, so that what it decides on is what holds at that moment.
+        """
+        table, owner = tables.channel, tables.environment
+        query = (
+            select(table, owner.c.name.label("environment"))
+            .join(owner, owner.c.id == table.c.environment_id)
+            .where(table.c.rollout_state.in_(OPEN_ROLLOUTS), owner.c.deleted.is_(None))
+            .order_by(owner.c.name, table.c.name)
+        )
+        with self._database.read() as connection:
+            rows = connection.execute(query).all()
+            due = [r for r in rows if _next(connection, r, now, decide) is not None]
+        out = []
+        for found in due:
+            with self._database.write() as connection:
+                row = environment_row(connection, found.environment, lock=True)
+                known = _row(connection, row, found.name)
+                if known is None or known.rollout_state not in OPEN_ROLLOUTS:
+                    continue
+                step = _next(connection, known, now, decide)
+                if step is not None:
+                    _take(connection, row, known, step, now)
+                    out.append((found.environment, _read(connection, row, found.name)))
+        return out
+
+
+Decide = Callable[[Rollout, Sequence[Robot], datetime], Step | None]
+
+
+def _next(connection: Connection, channel: Row[Any], now: datetime, decide: Decide) -> Step | None:
+    return decide(Rollout.from_dict(channel.rollout), robots_of(connection, channel.environment_id, channel.name), now)
+
+
+def _take(connection: Connection, environment: Row[Any], channel: Row[Any], step: Step, now: datetime) -> None:
+    """One step of a roll-out: the move or the way back with its event, or the end."""
+    rollout = Rollout.from_dict(channel.rollout)
+    ended = replace(rollout, state=step.state, detail=step.detail)
+    if step.do == "move":
+        author = channel.planned_author or ""
+        _move(connection, environment, channel.name, rollout.version, author, now, rollout=ended, reason=step.detail)
+    elif step.do == "move_back" and rollout.before is not None:
+        _move(
+            connection,
+            environment,
+            channel.name,
+            rollout.before,
+            channel.author,
+            now,
+            rollout=ended,
+            reason=step.detail,
+            rollback=True,
+        )
+    else:
+        _end(connection, environment, channel, step.state, step.detail)
+
+
+def _end(connection: Connection, environment: Row[Any], channel: Row[Any], state: RolloutState, detail: str) -> None:
+    """A roll-out is over; a move that still waits for it is dropped."""
+    rollout = replace(Rollout.from_dict(channel.rollout), state=state, detail=detail)
+    values: dict[str, Any] = {"rollout": rollout.as_dict(), "rollout_state": state}
+    if channel.rollout_state == "waiting":
+        values |= {"planned_version": None, "planned_at": None, "planned_author": None}
+    _store(connection, environment, channel.name, channel, **values)
 
 
 def _check_name(channel: str) -> None:
@@ -154,7 +253,8 @@ def _as_channel(row: Row[Any], root: str | None, planned_root: str | None) -> Ch
     planned = None
     if row.planned_version is not None:
         planned = Planned(row.planned_version, row.planned_at, row.planned_author or "", planned_root or "")
-    return Channel(row.name, row.version, root, row.sequence, planned, row.author, row.time)
+    rollout = None if row.rollout is None else Rollout.from_dict(row.rollout)
+    return Channel(row.name, row.version, root, row.sequence, planned, row.author, row.time, rollout)
 
 
 def _store(connection: Connection, environment: Row[Any], channel: str, known: object, **values: Any) -> None:
@@ -167,16 +267,35 @@ def _store(connection: Connection, environment: Row[Any], channel: str, known: o
         )
 
 
-def _move(connection: Connection, environment: Row[Any], channel: str, number: int, author: str, now: datetime) -> None:
+def _move(
+    connection: Connection,
+    environment: Row[Any],
+    channel: str,
+    number: int,
+    author: str,
+    now: datetime,
+    *,
+    rollout: Rollout | None = None,
+    reason: str = "",
+    rollback: bool = False,
+) -> None:
+    """Move a channel. rollout: what it belongs to; with a share of failures to look out for it is watched from now."""
     target = read_version(connection, environment, number)
     known = _row(connection, environment, channel)
-    nothing = {"planned_version": None, "planned_at": None, "planned_author": None}
+    nothing: dict[str, Any] = {"planned_version": None, "planned_at": None, "planned_author": None}
     before = None
     if known is not None and known.version is not None:
         before = read_version(connection, environment, known.version)
-        if before.number == number:
-            _store(connection, environment, channel, known, **nothing)
-            return
+    if rollout is not None and rollout.state in OPEN_ROLLOUTS:
+        watched = rollout.failed is not None and before is not None and before.number != number
+        state: RolloutState = "watching" if watched else "done"
+        rollout = replace(rollout, state=state, moved=now, before=before.number if before else None)
+    nothing |= {"rollout": None, "rollout_state": None}
+    if rollout is not None:
+        nothing |= {"rollout": rollout.as_dict(), "rollout_state": rollout.state}
+    if before is not None and before.number == number:
+        _store(connection, environment, channel, known, **nothing)
+        return
     sequence = environment.sequence + 1
     _store(
         connection,
@@ -190,10 +309,21 @@ def _move(connection: Connection, environment: Row[Any], channel: str, number: i
         **nothing,
     )
     _bump(connection, environment, sequence)
-    _tell(connection, environment, "channel.moved", channel, before, target, sequence=sequence, author=author, time=now)
+    about: dict[str, Any] = {"sequence": sequence, "author": author, "time": now}
+    if reason:
+        about["reason"] = reason
+    _tell(connection, environment, "channel.moved", channel, before, target, rollback=rollback, **about)
 
 
-def _plan(connection: Connection, environment: Row[Any], channel: str, number: int, author: str, at: datetime) -> None:
+def _plan(
+    connection: Connection,
+    environment: Row[Any],
+    channel: str,
+    number: int,
+    author: str,
+    at: datetime | None,
+    rollout: Rollout | None,
+) -> None:
     target = read_version(connection, environment, number)
     known = _row(connection, environment, channel)
     now = utcnow()
@@ -202,11 +332,20 @@ def _plan(connection: Connection, environment: Row[Any], channel: str, number: i
         before = read_version(connection, environment, known.version)
     sequence = environment.sequence + 1
     plan: dict[str, Any] = {"planned_version": number, "planned_at": at, "planned_author": author}
+    plan |= {"rollout": rollout and rollout.as_dict(), "rollout_state": rollout and rollout.state}
     if known is None:
         plan |= {"version": None, "sequence": 0, "author": author, "time": now}
     _store(connection, environment, channel, known, **plan)
     _bump(connection, environment, sequence)
-    about: dict[str, Any] = {"sequence": sequence, "author": author, "time": now, "activate_at": rfc3339(at)}
+    about: dict[str, Any] = {"sequence": sequence, "author": author, "time": now}
+    if at is not None:
+        about["activate_at"] = rfc3339(at)
+    if rollout is not None:
+        about["rollout"] = {
+            "ready": rollout.ready,
+            "failed": rollout.failed,
+            "deadline": None if rollout.deadline is None else rfc3339(rollout.deadline),
+        }
     _tell(connection, environment, "channel.planned", channel, before, target, **about)
 
 
@@ -217,6 +356,8 @@ def _tell(
     channel: str,
     before: Version | None,
     target: Version,
+    *,
+    rollback: bool = False,
     **about: Any,
 ) -> None:
     """The event of a channel that goes, or is planned to go, from one version to another."""
@@ -231,7 +372,7 @@ def _tell(
         layers=outbox.layer_changes(before.parts if before else (), target.parts),
         message=target.message,
         channel=channel,
-        rollback=before is not None and target.number < before.number,
+        rollback=rollback or (before is not None and target.number < before.number),
         **about,
     )
 

@@ -238,7 +238,10 @@ channel = Table(
     Column("planned_version", Integer, nullable=True),
     Column("planned_at", Moment, nullable=True, index=True),
     Column("planned_author", Text, nullable=True),
+    Column("rollout", JSON(none_as_null=True), nullable=True),
+    Column("rollout_state", String(16), nullable=True, index=True),
 )
+"""planned_at is NULL where the move waits for robots alone. rollout: as ``values.Rollout`` says it."""
 
 event = Table(
     "event",

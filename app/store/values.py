@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
 from typing import Any, Literal
 
@@ -245,12 +245,65 @@ def frame_line(datum: Datum | None, levels: Sequence[Level]) -> dict[str, Any]:
     }
 
 
+RolloutState = Literal["waiting", "watching", "done", "expired", "failed", "rolled_back", "cancelled"]
+OPEN_ROLLOUTS: tuple[RolloutState, ...] = ("waiting", "watching")
+
+
 @dataclass(frozen=True, slots=True)
-class Planned:
-    """A channel's next move."""
+class Rollout:
+    """A move in two stages: robots fetch the version first, and are watched after it.
+
+    ready: the channel moves when this share of its online robots has the version (None: at its time alone). failed: it
+    moves back, or does not move at all, when this share says that it failed. deadline: the move is given up then.
+    window: seconds of watching. before: the version that it moves back to. state: ``waiting`` until it moves,
+    ``watching`` after it, then how it ended.
+    """
 
     version: int
-    activate_at: datetime
+    root: str
+    started: datetime
+    ready: float | None = None
+    failed: float | None = None
+    activate_at: datetime | None = None
+    deadline: datetime | None = None
+    window: float = 600.0
+    state: RolloutState = "waiting"
+    before: int | None = None
+    moved: datetime | None = None
+    detail: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-like, with all members."""
+        out: dict[str, Any] = {}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            out[item.name] = rfc3339(value) if isinstance(value, datetime) else value
+        return out
+
+    @classmethod
+    def from_dict(cls, members: Mapping[str, Any]) -> Rollout:
+        """The reverse of ``as_dict``."""
+        values = dict(members)
+        for name in ("started", "activate_at", "deadline", "moved"):
+            values[name] = None if values[name] is None else datetime.fromisoformat(values[name])
+        return cls(**values)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What a roll-out does next: move, move back, or end as ``state`` says; and why."""
+
+    do: Literal["move", "move_back", "end"]
+    state: RolloutState
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A channel's next move. activate_at: None where it waits for robots alone."""
+
+    version: int
+    activate_at: datetime | None
     author: str = ""
     root: str = ""
 
@@ -259,7 +312,7 @@ class Planned:
 class Channel:
     """A movable name for a version. version and root are None where the first move is still planned.
 
-    sequence: of the event that moved it last (``latest``: of the event that made the head).
+    sequence: of the event that moved it last (``latest``: of the event that made the head). rollout: the last one.
     """
 
     name: str
@@ -269,6 +322,7 @@ class Channel:
     planned: Planned | None
     author: str
     time: datetime
+    rollout: Rollout | None = None
 
 
 @dataclass(frozen=True, slots=True)

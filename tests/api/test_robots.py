@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 from tests.api.conftest import Api
@@ -99,3 +100,45 @@ def test_all_robots_hold_the_root(api: Api, farm: str) -> None:
         "total": 3, "online": 3, "holding": 3, "lagging": 0, "failed": 0, "ready": 0,
         "since": last["holds"]["since"],
     }  # fmt: skip
+
+
+def test_a_rollout(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/channels/production"
+
+    def channel() -> Any:
+        return next(c for c in api.get(f"environments/{farm}/channels").json() if c["channel"] == "production")
+
+    def until(state: str) -> Any:
+        deadline = time.monotonic() + 20
+        while (now := channel())["rollout"]["state"] != state:
+            assert time.monotonic() < deadline, now
+            time.sleep(0.05)
+        return now
+
+    api("PUT", url, 200, json={"version": 2})
+    old, new = root_of(api, farm, 2), root_of(api, farm, 3)
+    for robot in ("two-1", "two-2"):
+        api("PUT", f"robots/{robot}/status", 200, json=status(farm, old))
+    planned = api("PUT", url, 200, json={"version": 3, "rollout": {"ready": 1, "failed": 0.5, "window": 60}}).json()
+    assert (planned["version"], planned["planned"]["version"], planned["planned"]["activate_at"]) == (2, 3, None)
+    assert planned["rollout"]["state"] == "waiting"
+    api("PUT", "robots/two-1/status", 200, json=status(farm, new, "ready"))
+    assert channel()["robots"]["ready"] == 1
+    assert channel()["version"] == 2
+    api("PUT", "robots/two-2/status", 200, json=status(farm, new, "ready"))
+    moved = until("watching")
+    assert (moved["version"], moved["robots"]["lagging"]) == (3, 2)
+    api("PUT", "robots/two-1/status", 200, json=status(farm, new))
+    api("PUT", "robots/two-2/status", 200, json=status(farm, new, "failed", detail="the costmap did not load"))
+    back = until("rolled_back")
+    assert (back["version"], back["rollout"]["detail"]) == (2, "1 of 2 robots failed")
+    assert back["sequence"] > moved["sequence"]
+    for bad in (
+        {}, {"ready": 0}, {"ready": 1.1}, {"failed": -1}, {"ready": 1, "window": 0}, {"more": 1},
+        {"failed": 0.5, "deadline": "2099-01-01T00:00:00Z"}, {"ready": 1, "deadline": "2020-01-01T00:00:00Z"},
+        {"ready": 1, "deadline": "2099-01-01T00:00:00"},
+    ):  # fmt: skip
+        api.problem("PUT", url, 422, json={"version": 3, "rollout": bad})
+    late = {"ready": 1, "deadline": "2098-01-01T00:00:00Z"}
+    api.problem("PUT", url, 422, json={"version": 3, "activate_at": "2099-01-01T00:00:00Z", "rollout": late})
+    api.token_for("robot", robot="two-1").problem("PUT", url, 403, json={"version": 3})

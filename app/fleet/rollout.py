@@ -1,0 +1,41 @@
+"""Roll-outs in two stages: robots fetch a version first, the channel moves when enough have it, and moves back when too
+many fail.
+
+Shares are of the channel's robots that are online. Robots that say that they failed count as well where they are not
+online any more: what broke them may have been the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime, timedelta
+
+from app.fleet.picture import is_online, is_ready
+from app.store.values import Robot, Rollout, Step
+
+
+def decide(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> Step | None:
+    """The next step of a roll-out, None for waiting on. robots: of its channel."""
+    begun = rollout.started if rollout.moved is None else rollout.moved
+    failed = [r for r in robots if r.report.state == "failed" and r.report.root == rollout.root and r.time >= begun]
+    names = {r.robot for r in failed}
+    counted = len(names | {r.robot for r in robots if is_online(r, now)})
+    broken = f"{len(names)} of {counted} robots failed"
+    too_many = rollout.failed is not None and bool(names) and len(names) >= rollout.failed * counted
+    if rollout.state == "watching":
+        if too_many:
+            return Step("move_back", "rolled_back", broken)
+        if now >= begun + timedelta(seconds=rollout.window):
+            return Step("end", "done", broken if names else "")
+        return None
+    if too_many:
+        return Step("end", "failed", f"{broken} to fetch it: the channel stays")
+    ready = [r for r in robots if is_online(r, now) and is_ready(r, rollout.root)]
+    online = sum(is_online(r, now) for r in robots)
+    enough = rollout.ready is None or (online > 0 and len(ready) >= rollout.ready * online)
+    if enough and (rollout.activate_at is None or now >= rollout.activate_at):
+        told = "its time has come" if rollout.ready is None else f"{len(ready)} of {online} robots are ready"
+        return Step("move", "waiting", told)
+    if rollout.deadline is not None and now >= rollout.deadline:
+        return Step("end", "expired", f"only {len(ready)} of {online} robots are ready: the channel stays")
+    return None

@@ -1,0 +1,206 @@
+"""Moves in two stages, on both databases."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import pytest
+
+from app.fleet import decide
+from app.store import Store
+from app.store.changes import Replace
+from app.store.values import Channel, Heard, Report, Rollout
+from tests.store.samples import GRID, grid, save
+
+
+class Fleet:
+    """Robots of the channel production, which stands on version 1; version 2 is to come."""
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        store.create_environment("farm")
+        self.roots = {k + 1: save(store, "farm", Replace(GRID, grid(seed=k))).root for k in range(3)}
+        store.set_channel("farm", "production", 1, author="ann")
+        self.start = datetime.now(UTC)
+
+    def at(self, seconds: float) -> datetime:
+        return self.start + timedelta(seconds=seconds)
+
+    def say(self, robots: str, version: int, state: Any, seconds: float = 1) -> None:
+        report = Report("production", version, self.roots[version], state)
+        assert not any(self.store.note_reports([Heard("farm", r, report, self.at(seconds)) for r in robots]))
+
+    def roll(self, version: int = 2, activate_at: datetime | None = None, **more: Any) -> Channel:
+        rollout = Rollout(0, "", self.start, **more)
+        return self.store.set_channel(
+            "farm", "production", version, author="bob", activate_at=activate_at, rollout=rollout
+        )
+
+    def tick(self, seconds: float) -> tuple[int | None, str]:
+        """(version, state of the roll-out) after it."""
+        self.store.apply_due(self.at(seconds))
+        self.store.advance_rollouts(self.at(seconds), decide)
+        now = self.channel()
+        return now.version, now.rollout.state if now.rollout else ""
+
+    def channel(self) -> Channel:
+        return next(c for c in self.store.channels("farm") if c.name == "production")
+
+    def told(self) -> list[dict[str, Any]]:
+        return [dict(e.body) for e in self.store.events("farm", since=5)]
+
+
+@pytest.fixture
+def fleet(store: Store) -> Fleet:
+    return Fleet(store)
+
+
+def test_it_moves_when_enough_are_ready(fleet: Fleet):
+    fleet.say("abcd", 1, "active")
+    planned = fleet.roll(ready=0.75)
+    assert planned.planned is not None
+    assert (planned.version, planned.planned.version, planned.planned.activate_at) == (1, 2, None)
+    assert planned.planned.root == fleet.roots[2]
+    (event,) = fleet.told()
+    assert (event["type"], event["version"]) == ("channel.planned", 2)
+    assert event["rollout"] == {"ready": 0.75, "failed": None, "deadline": None}
+    assert "activate_at" not in event
+    fleet.say("ab", 2, "ready", 2)
+    fleet.say("c", 2, "downloading", 2)
+    assert fleet.tick(3) == (1, "waiting")
+    fleet.say("c", 2, "ready", 4)
+    assert fleet.tick(5) == (2, "done")
+    event = fleet.told()[-1]
+    assert (event["type"], event["version"], event["previous"]["version"]) == ("channel.moved", 2, 1)
+    assert (event["rollback"], event["reason"], event["author"]) == (False, "3 of 4 robots are ready", "bob")
+    count = len(fleet.told())
+    assert fleet.tick(6) == (2, "done")
+    assert len(fleet.told()) == count
+    assert fleet.channel().planned is None
+
+
+def test_robots_that_are_away_are_not_waited_for(fleet: Fleet):
+    fleet.say("abcd", 1, "active", -1000)
+    fleet.say("a", 1, "active")
+    fleet.roll(ready=1.0)
+    assert fleet.tick(2) == (1, "waiting")
+    fleet.say("a", 2, "ready", 3)
+    assert fleet.tick(4) == (2, "done")
+
+
+def test_nobody_is_no_fleet(fleet: Fleet):
+    fleet.roll(ready=0.1, deadline=fleet.at(100))
+    assert fleet.tick(99) == (1, "waiting")
+    assert fleet.tick(100) == (1, "expired")
+    now = fleet.channel()
+    assert now.planned is None
+    assert now.rollout is not None
+    assert now.rollout.detail == "only 0 of 0 robots are ready: the channel stays"
+    assert fleet.tick(101) == (1, "expired")
+
+
+def test_not_before_its_time(fleet: Fleet):
+    fleet.say("a", 2, "ready")
+    fleet.roll(ready=1.0, activate_at=fleet.at(60))
+    assert fleet.told()[0]["activate_at"]
+    assert fleet.tick(59) == (1, "waiting")
+    assert fleet.tick(60) == (2, "done")
+    fleet.say("a", 2, "active", 61)
+    fleet.roll(3, ready=1.0, activate_at=fleet.at(70))
+    assert fleet.tick(71) == (2, "waiting"), "its time has come, its robots have not"
+    fleet.say("a", 3, "ready", 80)
+    assert fleet.tick(81) == (3, "done")
+
+
+def test_it_moves_back_when_too_many_fail(fleet: Fleet):
+    fleet.say("abcde", 1, "active")
+    fleet.roll(ready=0.6, failed=0.4, window=100.0)
+    fleet.say("abc", 2, "ready", 2)
+    fleet.say("d", 2, "failed", 2)
+    assert fleet.tick(3) == (2, "watching")
+    fleet.say("ab", 2, "active", 4)
+    assert fleet.tick(5) == (2, "watching"), "what failed before the move does not count after it"
+    fleet.say("c", 2, "failed", 6)
+    assert fleet.tick(7) == (2, "watching")
+    fleet.say("d", 2, "failed", 8)
+    assert fleet.tick(9) == (1, "rolled_back")
+    moved, back = (e for e in fleet.told() if e["type"] == "channel.moved")
+    assert back["sequence"] == moved["sequence"] + 1
+    assert (back["version"], back["root"], back["rollback"]) == (1, fleet.roots[1], True)
+    assert (back["previous"]["version"], back["reason"]) == (2, "2 of 5 robots failed")
+    assert fleet.channel().sequence == back["sequence"]
+    assert fleet.tick(10) == (1, "rolled_back")
+
+
+def test_back_to_a_newer_version_is_a_rollback_too(fleet: Fleet):
+    fleet.store.set_channel("farm", "production", 3, author="ann")
+    fleet.roll(2, failed=0.5)
+    assert fleet.tick(0) == (2, "watching"), "without a share to wait for it moves at once"
+    fleet.say("a", 2, "failed", 10)
+    assert fleet.tick(11) == (3, "rolled_back")
+    assert fleet.told()[-1]["rollback"] is True
+
+
+def test_robots_that_fail_and_vanish_count(fleet: Fleet):
+    fleet.say("abc", 1, "active")
+    fleet.roll(failed=0.5, window=10_000.0)
+    fleet.say("ab", 2, "failed", 2)
+    assert fleet.tick(1000) == (1, "rolled_back")
+
+
+def test_watching_ends(fleet: Fleet):
+    fleet.say("abc", 1, "active")
+    fleet.roll(failed=0.5, window=60.0)
+    assert fleet.tick(59) == (2, "watching")
+    assert fleet.tick(61) == (2, "done")
+    fleet.say("abc", 2, "failed", 62)
+    assert fleet.tick(63) == (2, "done")
+
+
+def test_what_cannot_be_fetched_is_not_activated(fleet: Fleet):
+    fleet.say("abc", 1, "active")
+    fleet.roll(ready=0.3, failed=0.5)
+    fleet.say("ab", 2, "failed", 2)
+    assert fleet.tick(3) == (1, "failed")
+    assert fleet.channel().planned is None
+    assert [e["type"] for e in fleet.told()] == ["channel.planned"]
+
+
+def test_another_move_ends_a_rollout(fleet: Fleet):
+    fleet.say("a", 1, "active")
+    fleet.roll(failed=0.1)
+    fleet.store.set_channel("farm", "production", 3, author="ann")
+    fleet.say("a", 2, "failed", 2)
+    assert fleet.tick(3) == (3, "")
+    fleet.roll(ready=1.0)
+    fleet.store.cancel_planned("farm", "production", "ann")
+    fleet.say("a", 2, "ready", 4)
+    assert fleet.tick(5) == (3, "cancelled")
+    fleet.roll(ready=1.0)
+    fleet.store.set_channel("farm", "production", 1, author="ann", activate_at=fleet.at(10))
+    assert fleet.tick(9) == (3, "")
+    assert fleet.tick(10) == (1, "")
+
+
+def test_a_first_move_has_nothing_to_go_back_to(fleet: Fleet):
+    rollout = Rollout(0, "", fleet.start, failed=0.1)
+    moved = fleet.store.set_channel("farm", "staging", 2, author="ann", rollout=rollout)
+    assert moved.rollout is not None
+    assert (moved.version, moved.rollout.state) == (2, "done")
+    same = fleet.store.set_channel("farm", "staging", 2, author="ann", rollout=rollout)
+    assert same.sequence == moved.sequence
+
+
+def test_a_decision_is_taken_again_where_it_is_carried_out(fleet: Fleet):
+    fleet.say("a", 2, "ready")
+    fleet.roll(ready=1.0)
+    asked = []
+
+    def changes_its_mind(*about: Any) -> Any:
+        asked.append(about)
+        return decide(*about) if len(asked) == 1 else None
+
+    assert fleet.store.advance_rollouts(fleet.at(2), changes_its_mind) == []
+    assert len(asked) == 2
+    assert fleet.channel().version == 1
