@@ -14,13 +14,12 @@ else        not: regions, points of interest, paths, roads, lights, measurements
 
 An area counts as it is, a line as wide as it is (``width``, else its kind's), a point as a disc or as a box of its
 size. It reaches from ``base`` (else OpenStreetMap's ``min_height`` and ``building:min_level``, else the floor) to
-``height`` (else ``height`` and ``building:levels`` among the tags, else without end).
+``height`` (else ``height`` and ``building:levels`` among the tags, else without end; ``app.model.osm_tags``).
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -32,7 +31,7 @@ from numpy.typing import NDArray
 
 from app.derive import Notes
 from app.errors import BadUpload, CannotConvert, Invalid, MissingDatum, NotFound, Problem
-from app.model import solids, worlds
+from app.model import osm_tags, solids, worlds
 from app.model.features import Features, Properties
 from app.model.frame import MAX_METRES
 from app.model.layers import Layers
@@ -68,9 +67,6 @@ MOST_TRIANGLES = 10_000_000
 
 WIDEST = 1000.0
 """Metres of a line's or a point's width: beyond it is a mistake."""
-
-LEVEL_HEIGHT = 3.0
-"""Metres of a storey, where only the number of storeys is known (OpenStreetMap's simple 3D buildings)."""
 
 OF_OSM: Mapping[str, Mapping[str, float]] = {
     "building": {"*": 0.1, "no": 0.0, "roof": 0.0},
@@ -110,8 +106,12 @@ OF_OSM: Mapping[str, Mapping[str, float]] = {
 
 IN_NO_WAY = "nothing in a robot's way"
 
-_NUMBER = re.compile(r"^\s*(\d+(?:[.,]\d+)?)\s*(m|cm|ft|')?\s*$")
-_UNITS = {None: 1.0, "m": 1.0, "cm": 0.01, "ft": 0.3048, "'": 0.3048}
+KEYS: Mapping[str, tuple[str, ...]] = {
+    "building": ("building", "building:part"),
+    "tree": ("natural",),
+    "water": ("natural", "waterway", "landuse", "leisure"),
+}
+"""The tags that an OpenStreetMap object's kind may come from, where it is not called as its main tag is."""
 
 
 @dataclass(slots=True)
@@ -316,12 +316,13 @@ def _tags(p: Properties) -> Mapping[str, Any]:
 def _width(kind: str, p: Properties) -> float | None:
     """How wide a line or a point of an object is in metres; None where the object stands in no way."""
     tags = _tags(p)
-    if kind in OF_OSM and kind in tags:
+    key = next((key for key in KEYS.get(kind, (kind,)) if key in tags), None)
+    if key is not None and key in OF_OSM:
         if tags.get("tunnel") in ("yes", "culvert", "flooded") or tags.get("location") in ("underground", "overhead"):
             return None
-        values = OF_OSM[kind]
-        width = values.get(str(tags[kind]), values.get("*", 0.0))
-        said = _metres(tags.get("width")) or _metres(tags.get("est_width")) or width
+        values = OF_OSM[key]
+        width = values.get(str(tags[key]), values.get("*", 0.0))
+        said = _positive(p.get("width")) or osm_tags.width(tags) or width
         return min(said, WIDEST) if width else None
     width = min(_positive(p.get("width")) or 0.0, WIDEST)
     if kind in OBSTACLES and not tags:
@@ -360,13 +361,9 @@ def _heights(p: Properties) -> tuple[float, float]:
     tags = _tags(p)
     base, top = _positive(p.get("base")), _positive(p.get("height"))
     if base is None:
-        base = _metres(tags.get("min_height"))
-        storeys = _metres(tags.get("building:min_level"))
-        base = storeys * LEVEL_HEIGHT if base is None and storeys is not None else base
+        base = osm_tags.base(tags)
     if top is None:
-        top = _metres(tags.get("height"))
-        storeys = _metres(tags.get("building:levels"))
-        top = storeys * LEVEL_HEIGHT if not top and storeys else top
+        top = osm_tags.height(tags)
     size = _size(p)
     if not top and size is not None and len(size) > 2 and size[2] > 0:
         pose = p.get("pose")
@@ -388,12 +385,6 @@ def _size(p: Properties) -> tuple[float, ...] | None:
     numbers = [_positive(v) for v in said[:3]]
     found = tuple(v for v in numbers if v is not None)
     return found if len(found) == len(numbers) and found[0] > 0 and found[1] > 0 else None
-
-
-def _metres(said: Any) -> float | None:
-    """An OpenStreetMap length or count; None where it is none."""
-    match = _NUMBER.match(said) if isinstance(said, str) and len(said) < 40 else None
-    return None if match is None else float(match[1].replace(",", ".")) * _UNITS[match[2]]
 
 
 def _relations(part: Features, rows: list[int]) -> dict[int, Any]:

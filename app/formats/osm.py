@@ -17,11 +17,14 @@ members    (relations) [type, id, role] in order
 children   elements that OSM does not know: [name, attributes]
 ========== ============================================================================================================
 
-An object's kind is its main tag's key (``building``, ``natural``, ``highway`` …), else ``point``, ``line`` or
-``relation``. Elements marked as deleted (``action="delete"``, ``visible="false"``) are kept, but
-no robot drives on them.
+An object's kind is its main tag's key (``building``, ``barrier``, ``highway`` …), ``tree`` and ``water`` for what is
+one, else ``point``, ``line`` or ``relation``; tags also say its ``height``, ``base`` and ``width`` (the rules are in
+``app.model.osm_tags``). An edge has its way's ``speed_limit`` (of its direction), ``width`` (else the lanes'),
+``surface`` and ``access``, and ``stairs``. Ways join where they share a node: a bridge and what is below it do not.
+Elements marked as deleted (``action="delete"``, ``visible="false"``) are kept, but no robot drives on them.
 
-Writing. The canonical content decides: a feature's place wins over what else is known of a node; a highway way comes
+Writing. The canonical content decides: a feature's place wins over what else is known of a node, and its name, height,
+speed limit … over the tags where they say something else; a highway way comes
 back whole while all its edges are in the network, and is split where edges are gone, have become one-way or carry other
 tags (the first piece keeps the id, the others get negative ones, and relations follow). Edges that no way explains
 become new ways with negative ids. Objects of other formats, and zones, are written as ways and nodes with the tags
@@ -45,6 +48,7 @@ from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext,
 from app.formats._osm import INT64, Attributes, Data, Tags, Way, is_pbf, parse, unpack
 from app.formats._osm_text import NOTHING, Node, as_texts, attribute_text, element_id, integers, plain
 from app.formats._text import DEGREES, numbers
+from app.model import osm_tags
 from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, points, segments
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, Part, PartKey
@@ -133,12 +137,75 @@ def deleted(attributes: Mapping[str, Any]) -> bool:
     return attributes.get("action") == "delete" or attributes.get("visible") == "false"
 
 
+KINDS: Mapping[str, Mapping[Any, str]] = {
+    "natural": {"tree": "tree", "water": "water"},
+    "waterway": dict.fromkeys(
+        ("river", "stream", "canal", "ditch", "drain", "tidal_channel", "riverbank", "dock"), "water"
+    ),
+    "landuse": {"basin": "water", "reservoir": "water"},
+}
+"""By a main tag's key and value, the kind where the key itself tells too little."""
+
+
 def kind_of(tags: Mapping[str, Any], otherwise: str) -> str:
-    """The key of the main tag."""
+    """The key of the main tag, or what its value says more plainly."""
     found = next((key for key in MAIN_TAGS if key in tags and tags[key] != "no"), None)
     if found is None:
         return str(tags["type"]) if otherwise == "relation" and tags.get("type") else otherwise
+    if found in KINDS:
+        return KINDS[found].get(tags[found], found)
     return "building" if found == "building:part" else found
+
+
+_MEASURES = frozenset({"height", "building:levels", "min_height", "building:min_level", "width", "est_width"})
+_MEASURES |= {"diameter", "circumference"}
+_SPOKEN = {"name": "name", "height": "height", "base": "min_height", "width": "width"}
+"""Canonical words of objects, and the tag that says each."""
+
+_EDGE_TAGS = frozenset({"maxspeed", "maxspeed:forward", "maxspeed:backward", "width", "est_width", "lanes"})
+_EDGE_TAGS |= {"surface", "access"}
+
+
+def object_words(tags: Mapping[str, Any]) -> dict[str, Any]:
+    """The canonical words that an object's tags say, but for its kind. A highway's measures are its edges'."""
+    out: dict[str, Any] = {}
+    if name := tags.get("name"):
+        out["name"] = name
+    if "highway" in tags or _MEASURES.isdisjoint(tags):
+        return out
+    found = {"height": osm_tags.height(tags), "base": osm_tags.base(tags), "width": osm_tags.width(tags)}
+    return out | {word: value for word, value in found.items() if value is not None}
+
+
+def edge_words(tags: Mapping[str, Any], way: Literal["forward", "backward"]) -> dict[str, Any]:
+    """The canonical words that a highway's tags say of its edges in one direction."""
+    out: dict[str, Any] = {}
+    if not _EDGE_TAGS.isdisjoint(tags):
+        if limit := osm_tags.speed_limit(tags, way):
+            out["speed_limit"] = limit
+        if width := osm_tags.way_width(tags):
+            out["width"] = width
+        out |= {key: tags[key] for key in ("surface", "access") if tags.get(key)}
+    if tags.get("highway") == "steps":
+        out["stairs"] = True
+    return out
+
+
+def _differs(now: Any, said: Any) -> bool:
+    """Whether a canonical value says something else than the tags; one that is absent says nothing."""
+    if isinstance(now, str):
+        return now not in ("", said)
+    if isinstance(now, bool) or not isinstance(now, int | float) or now <= 0:
+        return False
+    return not isinstance(said, int | float) or abs(now - said) > 1e-6 * now
+
+
+def _number(value: Any) -> str:
+    return plain(repr(round(float(value), 9))).removesuffix(".0")
+
+
+def _kmh(value: float) -> str:
+    return plain(f"{value * 3.6:.6g}")
 
 
 def is_area(tags: Mapping[str, Any]) -> bool:
@@ -323,9 +390,17 @@ class _Network:
             ids += edges.ids
             source += edges.source
             target += edges.target
+            there, back = edge_words(way.tags, "forward"), edge_words(way.tags, "backward")
+            refs = way.refs
             properties += [
-                {"kind": "edge", "source": f"n{a}", "target": f"n{b}", "osm": said}
-                for a, b in zip(edges.source, edges.target, strict=True)
+                {
+                    "kind": "edge",
+                    "source": f"n{a}",
+                    "target": f"n{b}",
+                    **(there if there == back or refs[k] == a else back),
+                    "osm": said,
+                }
+                for k, a, b in zip(edges.segment, edges.source, edges.target, strict=True)
             ]
         geometry = points(data.lonlat[wanted]) if wanted else np.empty(0, object)
         if source:
@@ -356,9 +431,9 @@ def _of_node(data: Data, k: int) -> dict[str, Any]:
 
 
 def _properties(said: dict[str, Any], tags: Tags, otherwise: str) -> Properties:
-    kind = kind_of(tags, otherwise)
-    name = tags.get("name")
-    return {"kind": kind, "name": name, "osm": said} if name else {"kind": kind, "osm": said}
+    if not tags:
+        return {"kind": otherwise, "osm": said}
+    return {"kind": kind_of(tags, otherwise), **object_words(tags), "osm": said}
 
 
 def _objects(data: Data, network: _Network, context: ReadContext, document: Properties) -> Features:
@@ -468,12 +543,13 @@ NOWHERE = (float("nan"), float("nan"))
 
 @dataclass(slots=True)
 class _Level:
-    """What is being written of one level. nodes: feature id -> OSM id. edges: id -> (source, target, tags)."""
+    """What is being written of one level. nodes: feature id -> OSM id. edges: id -> (source, target, tags,
+    properties)."""
 
     name: str
     nodes: dict[str, int] = field(default_factory=dict)
     moved: dict[int, int] = field(default_factory=dict)
-    edges: dict[str, tuple[str, str, Mapping[str, str] | None]] = field(default_factory=dict)
+    edges: dict[str, tuple[str, str, Mapping[str, str] | None, Properties]] = field(default_factory=dict)
     explained: set[str] = field(default_factory=set)
     ways: dict[int, list[int]] = field(default_factory=dict)
     relations: dict[int, int] = field(default_factory=dict)
@@ -536,7 +612,8 @@ class _Writer:
                 ):
                     number, said = element_id(i), properties.get("osm")
                     if layer == "objects" and key.name == FAMILY and number and isinstance(said, Mapping):
-                        mine.append((number[0], number[1], geometry, said, properties))
+                        told = _told(said, properties, i)
+                        mine.append((number[0], number[1], geometry, told, properties))
                     elif i in drawn and shapely.get_type_id(geometry) in (0, 1, 2, 5):
                         # The network made from this drawing is written; the line would lie on it a second time.
                         continue
@@ -599,6 +676,7 @@ class _Writer:
                 str(p.get("source")),
                 str(p.get("target")),
                 tags_ if isinstance(tags_, Mapping) else None,
+                p,
             )
 
     def node(self, level: _Level, number: int, geometry: Any, said: Mapping[str, Any]) -> None:
@@ -647,16 +725,29 @@ class _Writer:
         expected = way_edges(number, refs, tags, absent)
         # Of each segment: the directions that are there, of those that the way means, and the tags if they differ.
         there: dict[int, tuple[set[str], Any]] = {}
+        edited: dict[int, dict[str, dict[str, Any]]] = {}
+        known: dict[tuple[int, str], Mapping[str, Any]] = {}
         wanted: dict[int, int] = {}
         for k, i, a, b in zip(expected.segment, expected.ids, expected.source, expected.target, strict=True):
             wanted[k] = wanted.get(k, 0) + 1
             edge = level.edges.get(i)
             if edge is not None and edge[0] == f"n{a}" and edge[1] == f"n{b}":
                 level.explained.add(i)
-                ways, _ = there.get(k, (set(), None))
-                ways.add("forward" if a == refs[k] else "backward")
-                other = edge[2] if edge[2] is not None and edge[2] != tags else None
+                ways, other = there.get(k, (set(), None))
+                way: Literal["forward", "backward"] = "forward" if a == refs[k] else "backward"
+                ways.add(way)
+                other = edge[2] if edge[2] is not None and edge[2] != tags else other
                 there[k] = (ways, other)
+                own = tags if edge[2] is None else edge[2]
+                said = known.get((id(own), way))
+                if said is None:
+                    said = known[id(own), way] = edge_words(as_texts(own), way)
+                new = {w: v for w in _EDGE_WORDS if _differs(v := edge[3].get(w), said.get(w))}
+                if new:
+                    edited.setdefault(k, {})[way] = new
+        for k, changes in edited.items():
+            ways, other = there[k]
+            there[k] = (ways, _edited(tags if other is None else as_texts(other), changes, ways))
         if all(k in there and len(there[k][0]) == n and there[k][1] is None for k, n in wanted.items()):
             return [(0, len(refs), tags)]
         out: list[tuple[int, int, Mapping[str, str]]] = []
@@ -814,7 +905,13 @@ class _Writer:
     def edge_tags(self, i: str, p: Properties, level: _Level) -> dict[str, str]:
         said = p.get("osm")
         if isinstance(said, Mapping) and isinstance(said.get("tags"), Mapping):
-            return {k: v for k, v in as_texts(said["tags"]).items() if k != "oneway"}
+            own = {k: v for k, v in as_texts(said["tags"]).items() if k != "oneway"}
+            limits = {own.pop(k, None) for k in ("maxspeed:forward", "maxspeed:backward")} - {None}
+            words = edge_words(own, "forward")
+            new = {w: v for w in _EDGE_WORDS if _differs(v := p.get(w), words.get(w))}
+            if limits and "speed_limit" not in new and "maxspeed" not in own:
+                new["speed_limit"] = min((v for v in map(osm_tags.speed, limits) if v), default=None)
+            return dict(_edited(own, {"forward": {w: v for w, v in new.items() if v}}, {"forward"}))
         tags = {"highway": "path"}
         for word, key in (("name", "name"), ("action", "action"), ("width", "width")):
             value = p.get(word)
@@ -822,10 +919,13 @@ class _Writer:
                 tags[key] = str(value)
         speed = p.get("speed_limit")
         if isinstance(speed, int | float) and not isinstance(speed, bool):
-            tags["maxspeed"] = f"{speed * 3.6:.6g}"
+            tags["maxspeed"] = _kmh(speed)
+        tags |= {w: v for w in ("surface", "access") if isinstance(v := p.get(w), str) and v}
+        if p.get("stairs") is True:
+            tags["highway"] = "steps"
         if level.name != GROUND:
             tags["level"] = level.name
-        more = {"kind", "source", "target", "drawn_from", "name", "action", "width", "speed_limit"}
+        more = {"kind", "source", "target", "drawn_from", "name", "action", *_EDGE_WORDS, "stairs"}
         if p.keys() - more:
             self.lose("edges' further properties")
         return tags
@@ -937,6 +1037,37 @@ class _Writer:
         return out
 
 
+_EDGE_WORDS = ("speed_limit", "width", "surface", "access")
+
+
+def _told(said: Mapping[str, Any], p: Properties, i: str) -> Mapping[str, Any]:
+    """An object's own words with the tags that its name and measures say now. A highway's are its edges'."""
+    tags = as_texts(said.get("tags"))
+    if "highway" in tags:
+        return said
+    words = object_words(tags)
+    new = {w: v for w in _SPOKEN if _differs(v := p.get(w), words.get(w)) and v != i}
+    if not new:
+        return said
+    told = {_SPOKEN[w]: v if isinstance(v, str) else _number(v) for w, v in new.items()}
+    return {**said, "tags": {**tags, **told}}
+
+
+def _edited(tags: Mapping[str, str], changes: Mapping[str, Mapping[str, Any]], ways: Set[str]) -> Mapping[str, str]:
+    """A highway's tags with the words that its edges say now. changes: by direction; ways: those that are there."""
+    out = dict(tags)
+    limits = {way: new["speed_limit"] for way, new in changes.items() if "speed_limit" in new}
+    if limits and limits.keys() == ways and len(set(limits.values())) == 1:
+        for key in ("maxspeed:forward", "maxspeed:backward"):
+            out.pop(key, None)
+        out["maxspeed"] = _kmh(next(iter(limits.values())))
+    else:
+        out |= {f"maxspeed:{way}": _kmh(limit) for way, limit in sorted(limits.items())}
+    for new in changes.values():
+        out |= {w: v if isinstance(v, str) else _number(v) for w, v in new.items() if w != "speed_limit"}
+    return out
+
+
 def _course(geometry: Any) -> NDArray[np.float64] | None:
     """The vertices of a way's geometry; None where it is not of one piece."""
     whole = geometry.geom_type in ("LineString", "LinearRing", "Point") or geometry.is_empty
@@ -983,6 +1114,7 @@ register(
         needs=Needs(one_of=(frozenset({"objects"}), frozenset({"topology"})), anchor="wgs84"),
         family=FAMILY,
         rank=20,
+        version=2,
         extensions=(".osm", "osm.xml", ".osm.gz", ".osm.bz2", ".pbf"),
     )
 )

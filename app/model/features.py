@@ -17,6 +17,9 @@ topology   ``orientation``   [x, y, z, w], the quaternion of a node's pose in th
 topology   ``action``        what a robot does along an edge
 topology   ``speed_limit``   metres per second along an edge
 topology   ``width``         metres of free width along an edge
+topology   ``surface``       what an edge's ground is made of (``asphalt``, ``gravel``: OpenStreetMap's words)
+topology   ``access``        who may use an edge (``yes``, ``private``, ``no`` …: OpenStreetMap's words)
+topology   ``stairs``        true where an edge goes over steps
 zones      ``value``         what the kind needs: a speed in m/s, a priority …
 zones      ``expires``       RFC 3339 time at which the zone ends
 objects    ``pose``          [x, y, z, roll, pitch, yaw], metres and radians, local frame
@@ -24,6 +27,7 @@ objects    ``size``          [x, y, z], metres
 objects    ``shapes``        its solids, see ``app.model.solids``
 objects    ``height``        metres of an extruded footprint's top above the level's floor
 objects    ``base``          metres of its underside above the level's floor, else 0
+objects    ``width``         metres across a line or a point
 all        ``<format>``      what only that format knows of the item, kept for the way back
 ========== ================= =========================================================================================
 """

@@ -230,7 +230,7 @@ def test_the_samples_objects() -> None:
     barn = objects["w200"]
     assert barn.properties["kind"] == "building"
     assert barn.geometry.geom_type == "Polygon"
-    assert objects["n-3"].properties["kind"] == "natural"
+    assert objects["n-3"].properties["kind"] == "tree"
     assert objects["w201"].geometry.geom_type == "LineString"
     assert objects["n7"].geometry.is_empty
     assert objects["r300"].properties["kind"] == "restriction"
@@ -661,3 +661,89 @@ def test_more_attributes_than_any_element_has() -> None:
     many = " ".join(f"a{k}='x'" for k in range(50_000))
     with pytest.raises(UnreadableFile, match="50001 attributes"):
         read(f"<osm version='0.6' {many}></osm>".encode())
+
+
+# --- what tags say in canonical words --------------------------------------------------------------------------------
+
+TOWN = """<node id="1" lat="50" lon="7.0"/><node id="2" lat="50" lon="7.1"/><node id="3" lat="50" lon="7.2"/>
+<node id="4" lat="50.1" lon="7.1"/><node id="5" lat="49.9" lon="7.1"/>
+<node id="6" lat="50.2" lon="7"><tag k="natural" v="tree"/><tag k="height" v="12"/>
+<tag k="circumference" v="1.57"/></node>
+<node id="11" lat="50.3" lon="7"/><node id="12" lat="50.3" lon="7.1"/><node id="13" lat="50.4" lon="7.1"/>
+<way id="1"><nd ref="1"/><nd ref="2"/><nd ref="3"/><tag k="highway" v="residential"/><tag k="maxspeed" v="30 mph"/>
+<tag k="maxspeed:backward" v="walk"/><tag k="lanes" v="2"/><tag k="surface" v="asphalt"/></way>
+<way id="2"><nd ref="4"/><nd ref="5"/><tag k="highway" v="footway"/><tag k="bridge" v="yes"/><tag k="layer" v="1"/>
+<tag k="access" v="private"/><tag k="width" v="6'7&quot;"/></way>
+<way id="3"><nd ref="2"/><nd ref="4"/><tag k="highway" v="steps"/></way>
+<way id="4"><nd ref="11"/><nd ref="12"/><nd ref="13"/><nd ref="11"/><tag k="building" v="yes"/>
+<tag k="building:levels" v="4"/><tag k="min_height" v="3 m"/></way>
+<way id="5"><nd ref="11"/><nd ref="12"/><tag k="waterway" v="stream"/><tag k="width" v="2"/></way>
+<way id="6"><nd ref="12"/><nd ref="13"/><tag k="barrier" v="hedge"/><tag k="height" v="150 cm"/></way>
+<way id="7"><nd ref="11"/><nd ref="13"/><tag k="waterway" v="dam"/></way>"""
+
+
+def test_tags_in_canonical_words() -> None:
+    layers = read(xml(TOWN))
+    said = {f.id: {k: v for k, v in f.properties.items() if k != "osm"} for f in part(layers, OBJECTS)}
+    assert said["n6"] == {"kind": "tree", "height": 12.0, "width": pytest.approx(0.49974652)}
+    assert said["w4"] == {"kind": "building", "height": 12.0, "base": 3.0}
+    assert said["w5"] == {"kind": "water", "width": 2.0}
+    assert said["w6"] == {"kind": "barrier", "height": 1.5}
+    assert said["w7"] == {"kind": "waterway"}
+    assert said["w1"] == {"kind": "highway"}, "what a road measures is said of its edges"
+    edges = {f.id: f.properties for f in part(layers, TOPOLOGY) if f.properties["kind"] == "edge"}
+    road = {"width": 6.0, "surface": "asphalt"}
+    for i, limit in (("w1:1-2", 13.4112), ("w1:2-1", 1.666666667)):
+        own = {k: v for k, v in edges[i].items() if k not in ("kind", "source", "target", "osm")}
+        assert own == {**road, "speed_limit": limit}
+    assert (edges["w2:4-5"]["access"], edges["w2:4-5"]["width"]) == ("private", pytest.approx(2.0066))
+    assert edges["w3:2-4"]["stairs"] is True
+    # The bridge goes over the road and shares no node with it.
+    assert not any({p["source"], p["target"]} == {"n2", "n5"} for p in edges.values())
+    graph = network(layers)
+    assert set(graph["n5"]) == {"n4"}
+    assert write(read(write(layers))) == write(layers)
+
+
+def test_edited_words_change_their_tags() -> None:
+    layers = read(xml(TOWN))
+    objects = part(layers, OBJECTS)
+    new = {"w4": {"height": 15.0, "name": "Mill"}, "n6": {"width": 0.49974652}, "w6": {"height": None}}
+    rows = [(f.id, f.geometry, {**f.properties, **new.get(f.id, {})}) for f in objects]
+    layers = Layers({**layers.parts, OBJECTS: features(rows, "wgs84", objects.document)}, layers.datum, layers.levels)
+
+    def change(rows: list[Any]) -> list[Any]:
+        limits = {"w1:1-2": 5.0, "w1:2-3": 2.5, "w1:3-2": 2.5, "w2:4-5": 2.0, "w2:5-4": 2.0}
+        return [(i, g, {**p, "speed_limit": limits[i], "surface": "gravel"} if i in limits else p) for i, g, p in rows]
+
+    changed = edited(layers, change)
+    served = write(changed)
+    out = {k: v[2] for k, v in elements(served).items()}
+    assert out["w4"] == {"building": "yes", "building:levels": "4", "min_height": "3 m", "height": "15", "name": "Mill"}
+    assert out["n6"] == elements(write(read(xml(TOWN))))["n6"][2]
+    assert out["w6"] == {"barrier": "hedge", "height": "150 cm"}, "what is not said stays as the tags have it"
+    first = {"maxspeed": "30 mph", "maxspeed:backward": "walk", "maxspeed:forward": "18", "surface": "gravel"}
+    assert out["w1"] == {"highway": "residential", "lanes": "2", **first}
+    assert out["w-1"] == {"highway": "residential", "lanes": "2", "maxspeed": "9", "surface": "gravel"}
+    assert out["w2"]["maxspeed"] == "7.2"
+    again = {f.id: f.properties for f in part(read(served), TOPOLOGY) if f.properties["kind"] == "edge"}
+    assert again["w1:1-2"]["speed_limit"] == 5.0
+    assert again["w1:2-1"]["speed_limit"] == pytest.approx(1.666666667)
+    assert {again["w-1:2-3"]["speed_limit"], again["w-1:3-2"]["speed_limit"]} == {2.5}
+    # Without the ways the edges' own words make the tags.
+    bare = Layers({TOPOLOGY: part(changed, TOPOLOGY)}, changed.datum, changed.levels)
+    tags = [v[2] for k, v in elements(write(bare)).items() if k.startswith("w")]
+    assert {"highway": "footway", "bridge": "yes", "layer": "1", "access": "private", "width": "6'7\"",
+            "maxspeed": "7.2", "surface": "gravel"} in tags  # fmt: skip
+    assert sorted(t["maxspeed"] for t in tags if t["highway"] == "residential") == ["18", "6", "9"]
+
+
+def test_hostile_words_are_no_tags() -> None:
+    layers = read(xml(TOWN))
+    objects = part(layers, OBJECTS)
+    bad: list[Any] = [[1], {"a": 1}, True, -1, 0, "", None]
+    for value in bad:
+        rows = [(f.id, f.geometry, {**f.properties, "height": value, "name": value}) for f in objects]
+        odd = Layers({**layers.parts, OBJECTS: features(rows, "wgs84", objects.document)}, layers.datum, layers.levels)
+        odd = edited(odd, lambda rows, v=value: [(i, g, {**p, "width": v, "speed_limit": v}) for i, g, p in rows])
+        assert write(odd) == write(layers), value

@@ -1,0 +1,185 @@
+"""Topology -> occupancy: what a network says can be driven on is free, what stands in the way is occupied."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import Notes, _raster, derives
+from app.derive._obstacles import Site, fence_of, fences, sites
+from app.derive.objects_to_occupancy import HEIGHT, RESOLUTION, blank, framed
+from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer
+from app.model.features import Features, Properties
+from app.model.frame import GROUND
+from app.model.grid import FREE, OCCUPIED, OccupancyGrid
+from app.model.layers import MAP, Layers, Part, PartKey
+from app.parameters import parameter
+
+WIDTH = 1.0
+"""Metres of an edge of which nothing says how wide it is: a robot and some room."""
+
+OF_HIGHWAY: Mapping[str, float] = {
+    **dict.fromkeys(("motorway", "trunk"), 7.0),
+    **dict.fromkeys(("primary", "secondary", "tertiary", "unclassified", "residential"), 5.5),
+    **dict.fromkeys(("motorway_link", "trunk_link", "primary_link", "secondary_link", "tertiary_link"), 3.5),
+    **dict.fromkeys(("living_street", "pedestrian", "road"), 4.0),
+    **dict.fromkeys(("service", "track"), 3.0),
+    **dict.fromkeys(("footway", "cycleway", "bridleway"), 2.0),
+}
+"""OpenStreetMap: metres of a way by its class, where neither a width nor lanes are said. They are on the narrow side,
+so that what is called free is road."""
+
+WIDEST = 1000.0
+"""Metres of an edge's width: beyond it is a mistake."""
+
+MARGIN = 1.0
+"""Metres of unknown ground around everything."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """How wide, how fine, and what counts."""
+
+    edge_width: float | None = parameter(
+        None,
+        f"width of edges that do not say theirs; default: {WIDTH}, of an OpenStreetMap way that of its class",
+        minimum=0.01,
+        maximum=WIDEST,
+        unit="m",
+    )
+    resolution: float | None = parameter(
+        None,
+        f"metres a cell; default: {RESOLUTION}, or as much coarser as keeps a grid below 2^25 cells",
+        minimum=1e-3,
+        maximum=100.0,
+        unit="m",
+    )
+    stairs: bool = parameter(False, "whether edges over stairs are free ground")
+    obstacles: bool = parameter(True, "whether stored objects that stand in a robot's way are drawn as occupied")
+
+
+@derives(
+    gives="occupancy",
+    needs={"topology"},
+    also=frozenset({"objects", "resources", "location"}),
+    parameters=Parameters,
+    cost=40.0,
+)
+def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+    """Free along a network's edges, as wide as they are; occupied where objects stand; elsewhere unknown.
+
+    Objects win over edges, but in OpenStreetMap's passages through buildings. A fence cuts the free space. The origin
+    is a whole multiple of the resolution, yaw 0. Raises MissingLayer where no edge is to be driven on, MissingDatum for
+    places on earth without one, CannotConvert where the grid would be too large.
+    """
+    around = fences(layers, notes)
+    known = _obstacles(layers, notes) if parameters.obstacles else {}
+    parts: dict[PartKey, Part] = {}
+    for level in dict.fromkeys(key.level for key in layers.vector("topology")):
+        open_, through = _free(layers, level, parameters, notes)
+        if not len(open_) and not len(through):
+            continue
+        fence = fence_of(around, level, GROUND)
+        box = shapely.total_bounds(np.concatenate([open_, through])).tolist()
+        frame = framed(
+            (box[0] - MARGIN, box[1] - MARGIN, box[2] + MARGIN, box[3] + MARGIN), parameters.resolution, notes
+        )
+        cells = blank(frame, None, [shapely.Point(box[0], box[1])])  # a floor without an area: all is unknown
+        ground = open_ if fence is None else shapely.intersection(open_, fence)
+        _raster.paint(cells, _raster.areas(ground, frame, touched=False), FREE)
+        _draw(cells, frame, known.get(level))
+        if len(through):
+            inside = through if fence is None else shapely.intersection(through, fence)
+            _raster.paint(cells, _raster.areas(inside, frame, touched=False), FREE)
+        parts[PartKey("occupancy", level, MAP)] = OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
+    if not parts:
+        raise MissingLayer(
+            "free space is drawn along the edges of a network, and there are none to drive on: upload a network with "
+            "edges (where all of them go over stairs, ask with stairs=true)"
+        )
+    notes.warn("free is what the network says can be driven on; what else is free is not known")
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def _free(
+    layers: Layers, level: str, parameters: Parameters, notes: Notes
+) -> tuple[NDArray[np.object_], NDArray[np.object_]]:
+    """The ground of a level's edges in metres, polygons and lines: of usual ones, and of those through buildings."""
+    shapes: list[Any] = []
+    through: list[bool] = []
+    steps = flat = assumed = 0
+    for part in layers.vector("topology", level).values():
+        rows, widths, inner = [], [], []
+        for k, p in enumerate(part.properties):
+            if p.get("kind") != "edge":
+                continue
+            if p.get("stairs") is True and not parameters.stairs:
+                steps += 1
+                continue
+            said = _width(p)
+            assumed += said is None
+            rows.append(k)
+            widths.append(said or parameters.edge_width or OF_HIGHWAY.get(_tag(p, "highway"), WIDTH))
+            inner.append(_tag(p, "tunnel") == "building_passage" or _tag(p, "covered") == "yes")
+        lines = _metres(part.take(rows), layers)
+        made = shapely.buffer(lines, np.array(widths) / 2, quad_segs=4)
+        good = ~shapely.is_empty(made)
+        flat += int(np.count_nonzero(~good))
+        # The lines too: an edge narrower than a cell would have gaps.
+        shapes += [*made[good], *lines[good]]
+        through += np.array(inner, bool)[good].tolist() * 2
+    notes.drop("edges over stairs", steps, "wheels cannot climb them; see stairs")
+    notes.drop("edges without a course", flat, "they have no geometry")
+    if assumed:
+        told = parameters.edge_width or f"{WIDTH} m, of a way that of its class"
+        notes.fill("width of edges", told, f"{assumed} edges do not say how wide they are; see edge_width")
+    areas = np.empty(len(shapes), object)
+    areas[:] = shapes
+    chosen = np.array(through, bool)
+    return areas[~chosen], areas[chosen]
+
+
+def _metres(part: Features, layers: Layers) -> NDArray[np.object_]:
+    try:
+        return np.asarray(shapely.force_2d(part.in_local(layers.frame)), object)
+    except Invalid as error:  # too far from the datum
+        raise CannotConvert(error.detail, error.problems) from error
+
+
+def _width(p: Properties) -> float | None:
+    said = p.get("width")
+    good = isinstance(said, (int, float)) and not isinstance(said, bool) and 0 < said <= WIDEST
+    return float(said) if good and said is not None else None
+
+
+def _tag(p: Properties, key: str) -> str:
+    own = p.get("osm")
+    tags = own.get("tags") if isinstance(own, Mapping) else None
+    value = tags.get(key) if isinstance(tags, Mapping) else None
+    return value if isinstance(value, str) else ""
+
+
+def _obstacles(layers: Layers, notes: Notes) -> dict[str, Site]:
+    """What stands on each level; nothing where the objects are places on earth and there is no datum."""
+    try:
+        return sites(layers, notes)
+    except (MissingDatum, CannotConvert) as error:
+        notes.warn(f"objects are not drawn: {error.detail}")
+        return {}
+
+
+def _draw(cells: NDArray[np.uint8], frame: _raster.Frame, site: Site | None) -> None:
+    """What stands at a laser's height, as occupied."""
+    if site is None:
+        return
+    here = [f for f, b, t in zip(site.footprints, site.base, site.top, strict=True) if b <= HEIGHT < t]
+    slab = np.array([[HEIGHT, HEIGHT]])
+    meets = (site.triangles[:, :, 2].min(axis=1) <= HEIGHT) & (site.triangles[:, :, 2].max(axis=1) >= HEIGHT)
+    _raster.paint(cells, _raster.surfaces(site.triangles[meets], frame, slab), OCCUPIED)
+    _raster.paint(cells, _raster.insides(site.triangles[meets], site.owner[meets], frame, slab[:, 0]), OCCUPIED)
+    _raster.paint(cells, _raster.areas(here, frame, touched=True), OCCUPIED)

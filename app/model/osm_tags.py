@@ -1,0 +1,111 @@
+"""OpenStreetMap's values in SI units: lengths, widths, heights, speeds; for the format and for what looks at its tags.
+
+Sources: OSM wiki, Map features/Units (metres unless a unit is given; ``7'6"`` are feet and inches), Key:maxspeed (km/h
+unless a unit is given), Key:lanes, Simple 3D buildings (``height`` and ``min_height`` count from the ground; where they
+are missing a storey has 3 m).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, Literal
+
+LEVEL_HEIGHT = 3.0
+"""Metres of a storey, where only the number of storeys is known (Simple 3D buildings)."""
+
+LANE = 3.0
+"""Metres of a lane, where only the number of lanes is known: the narrow end of what is built (Key:lanes)."""
+
+WALK = 6 / 3.6
+"""Metres per second of ``maxspeed=walk``: 6 km/h, as GraphHopper has it."""
+
+WIDEST = 1e6
+"""Metres; beyond it is a mistake."""
+
+_LENGTH = re.compile(r"\s*(\d{1,9}(?:[.,]\d{1,9})?)\s*(m|cm|mm|km|mi|ft|feet|in|'|\")?\s*", re.ASCII)
+_FEET = re.compile(r"\s*(\d{1,6})\s*'\s*(\d{1,3}(?:\.\d{1,9})?)\s*\"\s*", re.ASCII)
+_UNITS: Mapping[str | None, float] = {
+    None: 1.0,
+    **{"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "mi": 1609.344},
+    **{"ft": 0.3048, "feet": 0.3048, "'": 0.3048, "in": 0.0254, '"': 0.0254},
+}
+_SPEED = re.compile(r"\s*(\d{1,4}(?:\.\d{1,9})?)\s*(km/h|kmh|kph|mph|knots)?\s*", re.ASCII)
+_SPEEDS: Mapping[str | None, float] = {
+    **dict.fromkeys((None, "km/h", "kmh", "kph"), 1 / 3.6),
+    **{"mph": 0.44704, "knots": 1852 / 3600},
+}
+_COUNT = re.compile(r"\s*(\d{1,3}(?:\.\d{1,3})?)\s*", re.ASCII)
+
+
+def metres(said: Any) -> float | None:
+    """A length; None where it is none."""
+    if not isinstance(said, str) or len(said) > 40:
+        return None
+    if match := _FEET.fullmatch(said):
+        value = int(match[1]) * 0.3048 + float(match[2]) * 0.0254
+    elif match := _LENGTH.fullmatch(said):
+        value = float(match[1].replace(",", ".")) * _UNITS[match[2]]
+    else:
+        return None
+    return round(value, 9) if value <= WIDEST else None
+
+
+def speed(said: Any) -> float | None:
+    """A speed limit in m/s, of several the lowest; None for what is none (``none``, ``RO:urban``, a condition)."""
+    if not isinstance(said, str) or len(said) > 80:
+        return None
+    found = []
+    for one in said.split(";"):
+        if one.strip() == "walk":
+            found.append(round(WALK, 9))
+        elif match := _SPEED.fullmatch(one):
+            found.append(round(float(match[1]) * _SPEEDS[match[2]], 9))
+    return min((v for v in found if v > 0), default=None)
+
+
+def count(said: Any) -> float | None:
+    """A number of storeys or lanes; None where it is none."""
+    match = _COUNT.fullmatch(said) if isinstance(said, str) and len(said) < 40 else None
+    return None if match is None else float(match[1])
+
+
+def width(tags: Mapping[str, Any]) -> float | None:
+    """Metres across a line or a point: ``width``, ``est_width``, what its ``diameter`` or ``circumference`` says."""
+    found = metres(tags.get("width")) or metres(tags.get("est_width"))
+    if not found and tags.get("natural") == "tree":
+        found = metres(tags.get("diameter"))
+        if not found and (around := metres(tags.get("circumference"))):
+            found = round(around / math.pi, 9)
+    return found or None
+
+
+def way_width(tags: Mapping[str, Any]) -> float | None:
+    """Metres across a way that is driven or walked on: its width, else its lanes'."""
+    found = width(tags)
+    if found:
+        return found
+    lanes = count(tags.get("lanes"))
+    return round(lanes * LANE, 9) if lanes else None
+
+
+def height(tags: Mapping[str, Any]) -> float | None:
+    """Metres of the top above the ground: ``height``, else its storeys'."""
+    found = metres(tags.get("height"))
+    if not found and (storeys := count(tags.get("building:levels"))):
+        found = round(storeys * LEVEL_HEIGHT, 9)
+    return found or None
+
+
+def base(tags: Mapping[str, Any]) -> float | None:
+    """Metres of the underside above the ground: ``min_height``, else the storeys that are left out."""
+    found = metres(tags.get("min_height"))
+    if found is None and (storeys := count(tags.get("building:min_level"))) is not None:
+        found = round(storeys * LEVEL_HEIGHT, 9)
+    return found or None
+
+
+def speed_limit(tags: Mapping[str, Any], way: Literal["forward", "backward"]) -> float | None:
+    """Metres per second along a way's direction or against it; that of the direction wins."""
+    return speed(tags.get(f"maxspeed:{way}")) or speed(tags.get("maxspeed"))
