@@ -10,7 +10,7 @@ ARGS ?=
 # uv installs the lock file in seconds; where it is absent it is put into the virtual environment first. The machine's
 # own certificates are trusted, as pip and curl do.
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo $(BIN)/uv)
-SYNC := UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen --inexact --quiet --no-python-downloads
+SYNC := UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen --extra server --inexact --quiet --no-python-downloads
 
 .PHONY: run test lint bench install install-dev clean
 

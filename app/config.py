@@ -116,6 +116,11 @@ class Settings(BaseSettings):
         description="Routers to connect to, separated by commas (`tcp/router:7447`): needed as `client`; as `router` "
         "its own router joins them.",
     )
+    zenoh_advertise: str = Field(
+        default="",
+        description="Where robots find the router, as `/readyz` tells them, separated by commas; `0.0.0.0` in it is "
+        "told as the host that the robot asked. Default: as `router`, where it listens; as `client`, nothing.",
+    )
     zenoh_prefix: str = Field(
         default="fleetmap",
         pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$",

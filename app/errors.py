@@ -120,3 +120,7 @@ class Unavailable(FleetMapError):
 
 class Damaged(FleetMapError):
     """Stored bytes that no longer match their hash. An alarm, never served."""
+
+
+class Untrusted(FleetMapError):
+    """What a robot was told and must not believe: a foreign signature, an old or expired manifest, wrong bytes."""

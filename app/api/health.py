@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 
 from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
@@ -21,6 +22,35 @@ READY_SECONDS = 5.0
 router = APIRouter(tags=["health"], route_class=Route)
 
 
+_ENDPOINT = re.compile(r"([a-z]+)/(.+):(\d+)(.*)")
+_HOST = re.compile(r"[A-Za-z0-9._-]+|[0-9A-Fa-f:.]+")
+_ANY = ("0.0.0.0", "[::]", "*")  # noqa: S104  nothing is bound here
+_LOOPBACK = ("127.0.0.1", "[::1]", "localhost")
+
+
+def router_for(advertised: str, listen: str, host: str) -> str:
+    """Endpoints of the router for who has reached this server under ``host``, separated by commas; may be empty.
+
+    A router on a loopback address is told only to who has come over one, unless the operator says so.
+    """
+    host = host if _HOST.fullmatch(host) else ""
+    host = f"[{host}]" if ":" in host else host
+    out = []
+    for part in (advertised or listen).split(","):
+        found = _ENDPOINT.fullmatch(part.strip())
+        if found is None:
+            continue
+        where = found[2]
+        if where in _ANY:
+            if not host:
+                continue
+            where = host
+        elif where in _LOOPBACK and not advertised and host not in _LOOPBACK:
+            continue
+        out.append(f"{found[1]}/{where}:{found[3]}{found[4]}")
+    return ",".join(out)
+
+
 @router.get("/healthz", summary="Alive")
 async def healthz() -> Response:
     """Answers as long as the process does, whatever the database and the conversions do."""
@@ -31,7 +61,8 @@ async def healthz() -> Response:
 async def readyz(request: Request) -> Response:
     """Whether database and file store answer and the schema is this release's.
 
-    It also tells whether events go out over Zenoh; where they do not, maps are served all the same.
+    It also tells whether events go out over Zenoh, and where a robot finds the router (`events.connect`,
+    `events.prefix`); where they do not, maps are served all the same.
     """
     here: Services = request.app.state.services
     try:
@@ -40,6 +71,10 @@ async def readyz(request: Request) -> Response:
     except TimeoutError:
         raise Unavailable(f"database or file store did not answer within {READY_SECONDS:g} seconds") from None
     events = state_of(here.options.data_dir, here.options.zenoh_mode)
+    if here.options.zenoh_mode != "off":
+        options = here.options
+        where = router_for(options.zenoh_advertise, options.zenoh_listen, request.url.hostname or "")
+        events = {**events, "prefix": options.zenoh_prefix, **({"connect": where} if where else {})}
     return answer({"status": "ready", "database": "ok", "blobs": "ok", "events": events})
 
 

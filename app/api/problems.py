@@ -74,6 +74,7 @@ STATUS: Mapping[type[errors.FleetMapError], tuple[int, str]] = {
     errors.Unauthenticated: (401, "Token needed"),
     errors.Unavailable: (503, "Unavailable"),
     errors.Damaged: (500, "Damaged data"),
+    errors.Untrusted: (500, "Not to be trusted"),
 }
 """Class -> status and title; a class that is not listed takes its nearest base's."""
 

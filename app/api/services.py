@@ -36,6 +36,9 @@ class ApiOptions:
     insecure_no_auth: bool = False
     data_dir: Path = Path("data")
     zenoh_mode: str = "off"
+    zenoh_prefix: str = "fleetmap"
+    zenoh_listen: str = ""
+    zenoh_advertise: str = ""
     manifest_seconds: int = 86_400
 
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from app import __version__
-from app.cli import history, maps, output, serving, tokens
+from app.cli import agent, history, maps, output, serving, tokens
 from app.cli.client import Refused
 from app.errors import FleetMapError
 
@@ -37,8 +37,8 @@ def run(arguments: Sequence[str]) -> int:
     """One command: its exit status. Errors are printed to standard error, as JSON with ``--json``."""
     as_json = "--json" in arguments
     completing = "_FLEETMAP_COMPLETE" in os.environ
-    command = build(all_flags=completing or list(arguments[:1]) == ["serve"])
     try:
+        command = build(all_flags=completing or list(arguments[:1]) == ["serve"])
         command(list(arguments), prog_name="fleetmap", standalone_mode=True)
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else int(error.code is not None)
@@ -48,6 +48,13 @@ def run(arguments: Sequence[str]) -> int:
         return 1
     except FleetMapError as error:
         output.show_problem(as_problem(error), hint=HINTS.get(type(error).__name__, ""), as_json=as_json)
+        return 1
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] == "app":
+            raise
+        detail = f"this command needs the server's packages ({error.name} is not installed)"
+        hint = 'pip install "fleet-map-server[server]"'
+        output.show_problem({"title": "Not installed", "detail": detail}, hint=hint, as_json=as_json)
         return 1
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
@@ -89,6 +96,7 @@ def build(*, all_flags: bool = True) -> typer.Typer:
         ("promote", history.promote),
         ("revert", history.revert),
         ("derive", history.derive),
+        ("agent", agent.agent),
         ("migrate", serving.migrate),
         ("demo", serving.demo),
     ):

@@ -32,8 +32,9 @@ def compose() -> dict[str, Any]:
     return loaded
 
 
-def test_compose_fits_its_schema() -> None:
-    told = tool("check-jsonschema", "--builtin-schema", "vendor.compose-spec", COMPOSE)
+@pytest.mark.parametrize("path", [COMPOSE, TOP / "docker" / "robot.compose.yaml"], ids=lambda p: p.name)
+def test_compose_fits_its_schema(path: Path) -> None:
+    told = tool("check-jsonschema", "--builtin-schema", "vendor.compose-spec", path)
     assert told.returncode == 0, told.stdout + told.stderr
 
 
@@ -43,8 +44,9 @@ def test_the_schema_check_refuses_what_is_wrong(tmp_path: Path) -> None:
     assert tool("check-jsonschema", "--builtin-schema", "vendor.compose-spec", wrong).returncode != 0
 
 
-def test_hadolint_has_nothing_to_say() -> None:
-    told = tool("hadolint", "--no-color", DOCKERFILE)
+@pytest.mark.parametrize("path", [DOCKERFILE, TOP / "docker" / "agent.Dockerfile"], ids=lambda p: p.name)
+def test_hadolint_has_nothing_to_say(path: Path) -> None:
+    told = tool("hadolint", "--no-color", path)
     assert told.returncode == 0, told.stdout + told.stderr
 
 
@@ -123,6 +125,7 @@ def test_the_lock_file_knows_every_dependency() -> None:
     lock = tomllib.loads((TOP / "uv.lock").read_text())
     locked = {package["name"] for package in lock["package"]}
     wanted = project["project"]["dependencies"] + project["dependency-groups"]["dev"]
+    wanted += project["project"]["optional-dependencies"]["server"]
     names = {re.split(r"[\[<>=!~; ]", text, maxsplit=1)[0].lower().replace("_", "-") for text in wanted}
     assert not names - locked
 

@@ -1,0 +1,492 @@
+"""The loop: hear or poll, verify, fetch what differs, switch, run the hooks, tell."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import random
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from app.agent import hooks, trust
+from app.agent.ear import Ear
+from app.agent.folder import Folder
+from app.agent.state import State, load, save
+from app.agent.trust import File, Manifest
+from app.agent.web import Busy, Stopped, Web
+from app.errors import FleetMapError, Invalid, NotFound, Untrusted
+from app.events import messages
+from app.events.messages import RobotState, RobotStatus
+
+LATEST = "latest"
+PRODUCTION = "production"
+POLL_SECONDS = 60.0
+FIRST_PAUSE_SECONDS = 1.0
+"""After the first failure; doubled each time up to the pause between polls."""
+
+GATHER_SECONDS = 0.02
+"""Events that come together are one look at the server."""
+
+REJOIN_SECONDS = 1.0
+"""A fleet that finds its router again does not ask in the same moment: up to so long."""
+
+NO_ROOT = "0" * 64
+
+Tell = Callable[..., None]
+"""tell(what, **members): one line of what happens."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How to run. channel: None follows production where there is one, else latest. key: to trust at first contact."""
+
+    server: str
+    environment: str
+    formats: tuple[str, ...]
+    into: Path
+    channel: str | None = None
+    robot: str = ""
+    on_change: tuple[str, ...] = ()
+    token: str | None = None
+    key: str | None = None
+    poll_seconds: float = POLL_SECONDS
+    zenoh_connect: str | None = None
+    zenoh_prefix: str | None = None
+    zenoh_config: Path | None = None
+
+
+def robot_name(text: str | None = None) -> str:
+    """A robot's name as it may be part of a key; the host's where none is given. Invalid."""
+    name = text or re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()).lstrip("_.-") or "robot"
+    if not messages.ROBOT_NAME.fullmatch(name):
+        raise Invalid(f"a robot's name is of letters, digits, dots, - and _, got {name!r}")
+    return name
+
+
+class Agent:
+    """One environment's map in one folder."""
+
+    def __init__(self, options: Options, tell: Tell) -> None:
+        if options.key is not None:
+            trust.check_given(options.key)
+        self.options, self._tell = options, tell
+        self._robot = robot_name(options.robot)
+        self._stopping = threading.Event()
+        self._wake = threading.Event()
+        self._folder = Folder(options.into)
+        self._web = Web(options.server, options.token, self._stopping)
+        self._ear: Ear | None = None
+        self._state = State(options.environment)
+        self._events: dict[int, messages.Event] = {}
+        self._lock = threading.Lock()
+        self._said: RobotStatus | None = None
+        self._put: RobotStatus | None = None
+        self._told: set[str] = set()
+        self._preloaded: tuple[int, str, tuple[File, ...]] | None = None
+        self._rejoined = False
+
+    # --- outside ---
+
+    def open(self) -> None:
+        """Take the folder and look at what is in it. Raises Conflict or Invalid where it is not ours."""
+        self._folder.open()
+        self._state = load(self._folder.state, self.options.environment)
+        given = self.options.key
+        if given is not None and given != self._state.given:
+            if self._state.key is not None and given not in (trust.key_id(self._state.key), _text(self._state.key)):
+                self._tell("trusting", key=given, detail="the key that was pinned before is forgotten")
+                self._state = dataclasses.replace(self._state, key=None)
+            self._state = dataclasses.replace(self._state, given=given)
+        installed = self._folder.manifest(self._folder.standing)
+        name = self._folder.standing
+        if installed is not None and name is not None and (bad := self._folder.damaged(name, installed)):
+            self._tell("damaged", version=installed.version, files=bad[:20])
+            self._state = dataclasses.replace(self._state, etag=None)
+
+    def close(self) -> None:
+        """Let go of everything."""
+        if self._ear is not None:
+            self._ear.close()
+        self._web.close()
+        self._folder.close()
+
+    def stop(self) -> None:
+        """End soon; may be called from a signal's handler or another thread."""
+        self._stopping.set()
+        self._wake.set()
+
+    def once(self) -> bool:
+        """One sync: whether the folder now holds the channel's map and all hooks were content."""
+        try:
+            return self._sync_and_tell()
+        except Stopped:
+            return False
+
+    def run(self) -> None:
+        """Keep the folder until ``stop``."""
+        self._ear = Ear(
+            self.options.environment,
+            self._robot,
+            heard=self._heard,
+            back=self._back,
+            config=self.options.zenoh_config,
+        )
+        if (installed := self._folder.manifest(self._folder.standing)) is not None:
+            self._tell("holding", version=installed.version, root=installed.root)
+        failures = 0
+        while not self._stopping.is_set():
+            self._wake.clear()
+            pause = self.options.poll_seconds
+            try:
+                self._find_router()
+                good = self._sync_and_tell()
+                failures = 0 if good else failures + 1
+            except Stopped:
+                break
+            if failures:
+                pause = min(pause, FIRST_PAUSE_SECONDS * 2 ** min(20, failures - 1))
+            self._wait(max(self._after, pause * random.uniform(0.5, 1.5)))  # noqa: S311  jitter is no secret
+
+    # --- what wakes it ---
+
+    def _wait(self, seconds: float) -> None:
+        if self._wake.wait(seconds) and not self._stopping.is_set():
+            rejoined, self._rejoined = self._rejoined, False
+            most = REJOIN_SECONDS * random.random() if rejoined else GATHER_SECONDS  # noqa: S311
+            self._stopping.wait(most)
+
+    def _heard(self, event: messages.Event) -> None:
+        """In a thread of Zenoh's: remember it, wake the loop if it is of our concern."""
+        if event.environment != self.options.environment:
+            return
+        channel = self._state.channel
+        mark = self._state.marks.get(channel or "", (-1, ""))[0]
+        if event.sequence <= mark:
+            return
+        with self._lock:
+            self._events[event.sequence] = event
+            while len(self._events) > 1000:
+                del self._events[min(self._events)]
+        ours = {self.options.channel} if self.options.channel else {PRODUCTION, channel}
+        if event.type == "version.created":
+            concerns = channel in (LATEST, None)
+        else:
+            concerns = event.channel in ours or event.type.startswith("environment.")
+        if concerns:
+            self._wake.set()
+
+    def _back(self) -> None:
+        self._tell("connected", detail="listening for events over Zenoh")
+        self._rejoined = True
+        self._put = None  # who was away may not know how we are
+        self._wake.set()
+
+    def _find_router(self) -> None:
+        if self._ear is None:
+            return
+        connect, prefix = self.options.zenoh_connect, self.options.zenoh_prefix
+        if connect is None or prefix is None:
+            try:
+                found = self._web.readyz().get("events", {})
+                told = found.get("connect")
+                connect = connect or (str(told) if told else None)
+                prefix = prefix or str(found.get("prefix") or messages.PREFIX)
+            except (FleetMapError, AttributeError):
+                if connect is None:
+                    return
+                prefix = prefix or messages.PREFIX
+        if connect is None:
+            self._tell_once("polling", detail="the server tells no router: FLEETMAP_ZENOH_CONNECT can name one")
+            return
+        self._ear.aim(connect, prefix)
+
+    # --- one sync ---
+
+    def _sync_and_tell(self) -> bool:
+        self._after = 0.0
+        try:
+            good = self._sync()
+        except FleetMapError as error:
+            if isinstance(error, Busy):
+                self._after = error.seconds
+            self._fail("refused" if isinstance(error, Untrusted) else "failed", error.detail)
+            good = False
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            self._fail("failed", f"{where}{error.strerror or error}")
+            good = False
+        self._send_status()
+        return good
+
+    _after = 0.0
+
+    def _sync(self) -> bool:
+        plans = self._plans()
+        channel = self._channel(plans)
+        manifest = self._manifest(channel)
+        if manifest is not None:
+            self._install(manifest)
+        good = self._run_hooks()
+        if good:
+            self._say("active")
+        if plans is not None:
+            self._preload(next((p for p in plans if p.get("channel") == channel), {}).get("planned"))
+        with self._lock:
+            mark = self._state.marks.get(channel, (0, ""))[0]
+            self._events = {s: e for s, e in self._events.items() if s > mark}
+        return good
+
+    def _plans(self) -> list[Mapping[str, Any]] | None:
+        try:
+            return self._web.channels(self.options.environment)
+        except (NotFound, Invalid) as error:
+            self._tell_once("channels", detail=error.detail)
+            return None
+
+    def _channel(self, plans: Sequence[Mapping[str, Any]] | None) -> str:
+        """Which channel to follow. One that was followed by default stays so, also where the server says it is gone."""
+        if self.options.channel is not None:
+            return self.options.channel
+        stands = any(p.get("channel") == PRODUCTION and p.get("version") is not None for p in plans or ())
+        if stands or PRODUCTION in self._state.marks:
+            return PRODUCTION
+        self._tell_once("following", channel=LATEST, detail="no channel production stands on a version yet")
+        return LATEST
+
+    def _manifest(self, channel: str) -> Manifest | None:
+        """The channel's manifest, believed; None where the installed one is still it."""
+        asked = f"{channel}?{','.join(self.options.formats)}"
+        state = self._state
+        current = state.asked == asked and state.etag is not None and state.expires > time.time()
+        fits = current and self._folder.standing is not None
+        found = self._web.manifest(
+            self.options.environment, channel, self.options.formats, state.etag if fits else None
+        )
+        if found is None:
+            return None
+        manifest, key = self._believe(found[0], found[1], channel, state.marks.get(channel))
+        new = dataclasses.replace(state, key=key).marked(channel, manifest.sequence, manifest.root)
+        if state.key != key:
+            self._tell("trusting", key=trust.key_id(key), detail="rotated" if state.key else "first contact")
+        self._keep(new)
+        self._etag = (asked, found[2], manifest.expires.timestamp())
+        return manifest
+
+    _etag: tuple[str, str | None, float] = ("", None, 0.0)
+
+    def _believe(
+        self, data: bytes, signature: str, channel: str | None, mark: tuple[int, str] | None
+    ) -> tuple[Manifest, bytes]:
+        key = trust.signer(data, signature, self._state.key, self._state.given, self._web.keys)
+        manifest = trust.parse(data, signature)
+        trust.check(
+            manifest,
+            environment=self.options.environment,
+            channel=channel,
+            formats=self.options.formats,
+            mark=mark,
+        )
+        return manifest, key
+
+    def _install(self, manifest: Manifest) -> None:
+        """Fetch what is not here, build the version, switch to it."""
+        name = self._folder.standing
+        installed = self._folder.manifest(name)
+        whole = name is not None and installed is not None and not self._folder.damaged(name, installed)
+        if not (whole and installed and (installed.content, installed.root) == (manifest.content, manifest.root)):
+            received, deltas, begun = self._web.received, self._web.deltas, time.monotonic()
+            self._say("downloading", manifest)
+            sources = self._fetch(manifest, installed)
+            layers = self._layers(installed, manifest)
+            self._keep(dataclasses.replace(self._state, layers=tuple(sorted({*self._state.layers, *layers}))))
+            name = self._folder.build(manifest, sources)
+            self._folder.switch(name)
+            self._tell(
+                "switched",
+                version=manifest.version,
+                root=manifest.root,
+                channel=manifest.channel,
+                sequence=manifest.sequence,
+                files=len(_changed(installed, manifest)),
+                bytes=self._web.received - received,
+                deltas=self._web.deltas - deltas,
+                seconds=round(time.monotonic() - begun, 3),
+            )
+        elif installed.data != manifest.data and name is not None:
+            self._folder.describe(name, manifest)  # the same files: a newer sequence or a later expiry
+        asked, etag, expires = self._etag
+        self._keep(dataclasses.replace(self._state, etag=etag, asked=asked, expires=expires))
+        self._folder.tidy(self._preloaded[2] if self._preloaded else ())
+
+    def _fetch(self, manifest: Manifest, installed: Manifest | None) -> dict[str, Path]:
+        index = self._folder.index()
+        old = {file.path: file for file in installed.files} if installed else {}
+        sources: dict[str, Path] = {}
+        wanted = []
+        for file in manifest.files:
+            there = self._folder.known(file, index)
+            if there is None:
+                wanted.append(file)
+            else:
+                sources[file.path] = there
+        self._folder.demand_room(sum(file.size for file in wanted))
+        for file in wanted:
+            ready = self._folder.ready(file)
+            if not ready.exists():  # two names can have the same bytes
+                before = self._folder.before(file, old)
+                self._web.fetch(manifest.environment, manifest.version, file, ready, before)
+            sources[file.path] = ready
+        return sources
+
+    def _layers(self, old: Manifest | None, new: Manifest) -> list[str]:
+        """The layers that changed: by the events from the old version to the new one, else by asking."""
+        if old is None or not self.options.on_change:
+            return []
+        with self._lock:
+            events = [self._events[s] for s in sorted(self._events)]
+        moved = [
+            e for e in events if e.channel == new.channel or (new.channel == LATEST and e.type == "version.created")
+        ]
+        at, layers = old.root, set()
+        for event in moved:
+            previous = event.body.get("previous")
+            if isinstance(previous, dict) and previous.get("root") == at and event.sequence <= new.sequence:
+                at = event.root
+                layers |= {str(part.get("layer")) for part in event.body.get("layers", ()) if isinstance(part, dict)}
+        if at == new.root:
+            return sorted(layers)
+        try:
+            return self._web.changed_layers(new.environment, old.version, new.version)
+        except FleetMapError as error:
+            self._tell("layers", detail=f"which layers changed is not known: {error.detail}")
+            return []
+
+    def _preload(self, planned: Any) -> None:
+        """Fetch what a channel is planned to move to, so that the switch itself takes no time."""
+        version = planned.get("version") if isinstance(planned, dict) else None
+        if type(version) is not int:
+            if self._preloaded is not None:
+                self._preloaded = None
+                self._folder.tidy()
+            return
+        if self._preloaded is not None and self._preloaded[0] == version:
+            self._say("ready", preloaded=self._preloaded)
+            return
+        found = self._web.manifest(self.options.environment, str(version), self.options.formats)
+        if found is None:
+            return
+        manifest, _ = self._believe(found[0], found[1], None, None)
+        self._preloaded = (manifest.version, manifest.root, manifest.files)
+        self._fetch(manifest, self._folder.manifest(self._folder.standing))
+        self._say("ready", preloaded=self._preloaded)
+
+    # --- hooks ---
+
+    def _run_hooks(self) -> bool:
+        """Run what is to be run for the version that stands and was not yet: whether all were content."""
+        name = self._folder.standing
+        manifest = self._folder.manifest(name)
+        if name is None or manifest is None or self._state.activated == name:
+            return True
+        before = self._folder.manifest(self._state.activated)
+        variables = {
+            "FLEETMAP_ENVIRONMENT": manifest.environment,
+            "FLEETMAP_VERSION": str(manifest.version),
+            "FLEETMAP_ROOT": manifest.root,
+            "FLEETMAP_CHANNEL": manifest.channel or "",
+            "FLEETMAP_SEQUENCE": str(manifest.sequence),
+            "FLEETMAP_CURRENT": str(self._folder.current),
+            "FLEETMAP_CHANGED": "\n".join(_changed(before, manifest)),
+            "FLEETMAP_LAYERS": " ".join(self._state.layers),
+            "FLEETMAP_ROBOT": self._robot,
+        }
+        for command in self.options.on_change:
+            problem = hooks.run(command, variables)
+            if problem is not None:
+                self._fail(
+                    "failed", f"version {manifest.version} is in place, but its robot has not taken it: {problem}"
+                )
+                self._keep(dataclasses.replace(self._state, activated=None))  # what it took of it is not known
+                return False
+            self._tell("hook", command=command, version=manifest.version)
+        self._keep(dataclasses.replace(self._state, activated=name, layers=()))
+        return True
+
+    # --- what is told ---
+
+    def _keep(self, state: State) -> None:
+        if state != self._state:
+            self._state = state
+            save(self._folder.state, state)
+
+    def _say(
+        self,
+        state: RobotState,
+        target: Manifest | None = None,
+        detail: str | None = None,
+        preloaded: tuple[int, str, tuple[File, ...]] | None = None,
+    ) -> None:
+        """Note the status and send it. version and root: of what stands, or what is being fetched or lies ready."""
+        manifest = target or self._folder.manifest(self._folder.standing)
+        version, root = (manifest.version, manifest.root) if manifest else (0, NO_ROOT)
+        if preloaded is not None:
+            version, root = preloaded[:2]
+        channel = self._state.channel or self.options.channel or LATEST
+        sequence = manifest.sequence if manifest else None
+        now = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        detail = detail[: messages.MAX_DETAIL] if detail else None
+        status = RobotStatus(channel, version, root, state, detail, now, sequence)
+        if _same(status, self._said):
+            return
+        self._said = status
+        if detail is None:
+            self._tell(state, version=version, root=root, channel=channel)
+        self._send_status()
+
+    def _fail(self, what: str, detail: str) -> None:
+        self._tell(what, detail=detail)
+        self._say("failed", detail=detail)
+
+    def _send_status(self) -> None:
+        """Over Zenoh and over HTTP, once for each change; what could not be sent is sent with the next sync."""
+        status = self._said
+        if status is None or _same(status, self._put) or self._stopping.is_set():
+            return
+        if self._ear is not None:
+            self._ear.put_status(status)
+        try:
+            self._web.put_status(self._robot, {"environment": self.options.environment, **status.as_dict()})
+            self._put = status
+        except Busy:
+            pass
+        except FleetMapError as error:
+            if not isinstance(error, NotFound) and "no answer" in error.detail:
+                return  # that is told already
+            self._tell_once("status", detail=f"the server does not take the robot's status: {error.detail}")
+            self._put = status
+
+    def _tell_once(self, what: str, **members: Any) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            self._tell(what, **members)
+
+
+def _same(one: RobotStatus, other: RobotStatus | None) -> bool:
+    return other is not None and dataclasses.replace(one, time=None) == dataclasses.replace(other, time=None)
+
+
+def _changed(old: Manifest | None, new: Manifest) -> list[str]:
+    """Paths of files that are new, gone or other."""
+    before, after = old.content if old else {}, new.content
+    return sorted(path for path in {*before, *after} if before.get(path) != after.get(path))
+
+
+def _text(key: bytes) -> str:
+    return base64.b64encode(key).decode()

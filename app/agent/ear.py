@@ -1,0 +1,192 @@
+"""The robot's Zenoh session: it hears of changes at once, and says how the robot is.
+
+Events are hints; what is true comes over HTTP, signed. So a forged event costs a request and changes nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import zenoh
+from zenoh import ext
+
+from app.errors import FleetMapError
+from app.events import messages
+
+LOOK_SECONDS = 0.5
+"""Between two looks whether the router is there."""
+
+CONNECT_MS = 5000
+MAX_PAUSE_SECONDS = 30.0
+MAX_EVENT_BYTES = 4 * 2**20
+
+
+class Ear:
+    """A session that is opened as soon as it can be, in a thread of its own. Methods are thread-safe.
+
+    heard: called with each event of the environment. back: called when the router is there (again).
+    """
+
+    def __init__(
+        self,
+        environment: str,
+        robot: str,
+        *,
+        heard: Callable[[messages.Event], None],
+        back: Callable[[], None],
+        config: Path | None = None,
+    ) -> None:
+        self._environment, self._robot, self._heard, self._back = environment, robot, heard, back
+        self._config = config
+        self._where: tuple[str, str] | None = None
+        self._session: zenoh.Session | None = None
+        self._held: list[Any] = []
+        self._lock = threading.Lock()
+        self._stopping = threading.Event()
+        self._aimed = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.problem: str | None = None
+
+    def aim(self, connect: str, prefix: str) -> None:
+        """Where the router is; the first call starts the thread, another address opens the session anew."""
+        if self._where == (connect, prefix):
+            return
+        self._where = (connect, prefix)
+        self._aimed.set()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="fleetmap-ear", daemon=True)
+            self._thread.start()
+
+    @property
+    def connected(self) -> bool:
+        """Whether a router is there at this moment."""
+        session = self._session
+        try:
+            return session is not None and bool(session.info.routers_zid())
+        except zenoh.ZError:
+            return False
+
+    def put_status(self, status: messages.RobotStatus) -> bool:
+        """Say how the robot is: whether a router took it."""
+        with self._lock:
+            if self._session is None or self._where is None or not self.connected:
+                return False
+            key = messages.status_key(self._where[1], self._environment, self._robot)
+            try:
+                self._session.put(
+                    key,
+                    messages.dumps(status.as_dict()),
+                    encoding=messages.JSON,
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    express=True,
+                )
+            except zenoh.ZError:
+                return False
+            return True
+
+    def close(self) -> None:
+        """End the session: the robot's token goes with it."""
+        self._stopping.set()
+        self._aimed.set()
+        if self._thread is not None:
+            self._thread.join(CONNECT_MS / 1000 + 5)
+        self._shut()
+
+    # --- the thread ---
+
+    def _run(self) -> None:
+        pause = 1.0
+        there = False
+        while not self._stopping.is_set():
+            if self._aimed.is_set():
+                self._aimed.clear()
+                self._shut()
+                there = False
+            if self._session is None:
+                if not self._open():
+                    self._aimed.wait(pause * random.uniform(0.5, 1.5))  # noqa: S311  jitter is no secret
+                    pause = min(MAX_PAUSE_SECONDS, pause * 2)
+                    continue
+                pause = 1.0
+            now = self.connected
+            if now and not there:
+                self._back()
+            there = now
+            self._aimed.wait(LOOK_SECONDS)
+
+    def _open(self) -> bool:
+        assert self._where is not None
+        connect, prefix = self._where
+        try:
+            session = zenoh.open(configuration(connect, self._config))
+        except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
+            lines = str(error).splitlines()
+            self.problem = f"no router at {connect}: {lines[0][:300] if lines else error!r}"
+            return False
+        try:
+            held = [
+                session.liveliness().declare_token(messages.robot_key(prefix, self._robot)),
+                ext.declare_advanced_subscriber(
+                    session,
+                    messages.events_key(prefix, self._environment),
+                    self._take,
+                    history=ext.HistoryConfig(detect_late_publishers=True),
+                    recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+                ),
+            ]
+        except Exception as error:  # noqa: BLE001
+            self.problem = f"the router at {connect} refuses: {error}"
+            with contextlib.suppress(Exception):
+                _close(session)
+            return False
+        with self._lock:
+            self._session, self._held = session, held
+        self.problem = None
+        return True
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        if sample.kind != zenoh.SampleKind.PUT or len(sample.payload) > MAX_EVENT_BYTES:
+            return
+        try:
+            event = messages.Event.from_json(bytes(sample.payload))
+        except FleetMapError:
+            return
+        self._heard(event)
+
+    def _shut(self) -> None:
+        with self._lock:
+            session, held = self._session, self._held
+            self._session, self._held = None, []
+        for item in held:
+            with contextlib.suppress(Exception):
+                item.undeclare()
+        if session is not None:
+            with contextlib.suppress(Exception):
+                _close(session)
+
+
+def configuration(connect: str, file: Path | None = None) -> zenoh.Config:
+    """A client of the routers at ``connect`` (separated by commas). file: Zenoh's own JSON5 for TLS and users."""
+    config = zenoh.Config.from_file(str(file)) if file is not None else zenoh.Config()
+    values: Mapping[str, Any] = {
+        "mode": "client",
+        "connect/endpoints": [part.strip() for part in connect.split(",") if part.strip()],
+        "connect/timeout_ms": CONNECT_MS,
+        "connect/exit_on_failure": True,
+        "listen/endpoints": [],
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+    }
+    for key, value in values.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _close(session: Any) -> None:
+    session.close()

@@ -1,0 +1,269 @@
+"""What stands on the robot's disk.
+
+::
+
+    DIR/current -> versions/7-9f3c21aa       switched by one rename: what it names is always whole and verified
+    DIR/versions/7-9f3c21aa/<format>/<file>  with manifest.json, manifest.sig and environment.sh
+    DIR/partial/<sha256>[.part]              what was fetched, whole or not yet
+    DIR/state.json, DIR/lock
+
+Files that did not change are hard links to those of the version before, so they are read-only.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import shlex
+import shutil
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import IO
+
+from app.agent.state import sync_folder
+from app.agent.trust import File, Manifest, parse
+from app.errors import Conflict, Unavailable, Untrusted
+
+KEPT = 2
+"""Old versions that stay, beside the current one."""
+
+READ_ONLY = 0o444
+CHUNK = 1 << 20
+
+
+class Folder:
+    """One robot's folder of one environment. Only one agent has it at a time."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path.absolute()
+        self.current = self.path / "current"
+        self.versions = self.path / "versions"
+        self.partial = self.path / "partial"
+        self.state = self.path / "state.json"
+        self._lock: IO[str] | None = None
+
+    def open(self) -> None:
+        """Make what is absent and take the lock; Conflict where another agent has it."""
+        for folder in (self.path, self.versions, self.partial):
+            folder.mkdir(parents=True, exist_ok=True)
+        if self.current.exists() and not self.current.is_symlink():
+            raise Conflict(f"{self.current} is there and is not an agent's link: use another folder")
+        handle = (self.path / "lock").open("a")
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            handle.close()
+            raise Conflict(f"another agent keeps {self.path}") from None
+        self._lock = handle
+        for left in self.versions.glob(".*"):
+            shutil.rmtree(left, ignore_errors=True)
+
+    def close(self) -> None:
+        """Give the lock back."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    # --- what is there ---
+
+    @property
+    def standing(self) -> str | None:
+        """The name of the version that ``current`` points to."""
+        try:
+            return Path(self.current.readlink()).name
+        except OSError:
+            return None
+
+    def manifest(self, name: str | None) -> Manifest | None:
+        """The manifest of a version that is there."""
+        if name is None:
+            return None
+        where = self.versions / name
+        try:
+            return parse((where / "manifest.json").read_bytes(), (where / "manifest.sig").read_text().strip())
+        except (OSError, ValueError, Untrusted):
+            return None
+
+    def damaged(self, name: str, manifest: Manifest) -> list[str]:
+        """Files of a version that are absent or have other bytes than their manifest says."""
+        return [file.path for file in manifest.files if not _holds(self.versions / name / file.path, file)]
+
+    def ready(self, file: File) -> Path:
+        """Where a fetched file lies once it is whole and verified."""
+        return self.partial / file.sha256
+
+    def index(self) -> dict[str, list[Path]]:
+        """SHA-256 -> files of the versions that are there, as their manifests tell; not verified yet."""
+        found: dict[str, list[Path]] = {}
+        for name in self._names():
+            manifest = self.manifest(name)
+            for file in manifest.files if manifest else ():
+                found.setdefault(file.sha256, []).append(self.versions / name / file.path)
+        return found
+
+    def known(self, file: File, index: Mapping[str, Sequence[Path]]) -> Path | None:
+        """A file with these bytes, fetched or of a version that is there; its hash is verified now."""
+        fetched = self.ready(file)
+        if fetched.exists():
+            return fetched
+        return next((path for path in index.get(file.sha256, ()) if _holds(path, file)), None)
+
+    def before(self, file: File, installed: Mapping[str, File]) -> tuple[Path, str] | None:
+        """The file of this name that is installed, with its hash: a dictionary for a delta."""
+        old = installed.get(file.path)
+        standing = self.standing
+        if old is None or standing is None:
+            return None
+        where = self.versions / standing / old.path
+        return (where, old.sha256) if _holds(where, old) else None
+
+    def demand_room(self, count: int) -> None:
+        """Unavailable where so many bytes do not fit."""
+        free = shutil.disk_usage(self.path).free
+        if free < count + CHUNK:
+            raise Unavailable(f"the new map needs {count} bytes more and {self.path} has {free} left")
+
+    # --- what changes ---
+
+    def describe(self, name: str, manifest: Manifest) -> None:
+        """A newer manifest of a version that is there: the same files under a later sequence or expiry."""
+        self._describe(self.versions / name, manifest)
+
+    def build(self, manifest: Manifest, sources: dict[str, Path]) -> str:
+        """A version's folder, whole and on the disk, not yet current: its name. sources: path -> verified file."""
+        base = f"{manifest.version}-{manifest.root[:8]}"
+        for name in (n for n in self._names() if n == base or n.startswith(base + ".")):
+            there = self.manifest(name)
+            if there is not None and there.content == manifest.content and not self.damaged(name, there):
+                self.describe(name, manifest)
+                return name
+        staging = self.versions / ".new"
+        shutil.rmtree(staging, ignore_errors=True)
+        staging.mkdir()
+        folders = {staging}
+        for file in manifest.files:
+            target = staging / file.path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            folders |= {parent for parent in target.parents if staging in parent.parents}
+            _link(sources[file.path], target)
+        self._describe(staging, manifest)
+        for folder in folders:
+            sync_folder(folder)
+        name, count = base, 0
+        while (self.versions / name).exists():
+            count += 1
+            name = f"{base}.{count}"
+        staging.rename(self.versions / name)
+        sync_folder(self.versions)
+        return name
+
+    def switch(self, name: str) -> None:
+        """Make a built version the current one, at once."""
+        now = time.time()
+        os.utime(self.versions / name, (now, now))
+        link = self.path / ".current.new"
+        link.unlink(missing_ok=True)
+        link.symlink_to(Path("versions") / name)
+        link.replace(self.current)
+        sync_folder(self.path)
+
+    def tidy(self, keep: Iterable[File] = ()) -> None:
+        """Remove versions beyond the kept ones, and fetched files but those to keep."""
+        standing = self.standing
+        others = [n for n in self._names() if n != standing]
+        for name in others[KEPT:]:
+            gone = self.versions / f".{name}"
+            (self.versions / name).rename(gone)
+            shutil.rmtree(gone, ignore_errors=True)
+        wanted = {file.sha256 for file in keep}
+        for path in self.partial.iterdir():
+            if path.name.removesuffix(".part") not in wanted:
+                path.unlink(missing_ok=True)
+
+    def _names(self) -> list[str]:
+        """Versions that are there, the last used first."""
+        found = [p for p in self.versions.iterdir() if p.is_dir() and not p.name.startswith(".")]
+        return [p.name for p in sorted(found, key=lambda p: (-p.stat().st_mtime, p.name))]
+
+    def _describe(self, where: Path, manifest: Manifest) -> None:
+        """The manifest and environment.sh in a version's folder."""
+        for name, data in (
+            ("manifest.sig", manifest.signature.encode() + b"\n"),
+            ("environment.sh", environment_sh(manifest, self.current).encode()),
+            ("manifest.json", manifest.data),
+        ):
+            temporary = where / f".{name}.new"
+            with temporary.open("wb") as stream:
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+            temporary.replace(where / name)
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _holds(path: Path, file: File) -> bool:
+    try:
+        return path.stat().st_size == file.size and digest(path) == file.sha256
+    except OSError:
+        return False
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # a file system without links, or with too many to this file
+        shutil.copyfile(source, target)
+        with target.open("rb+") as stream:
+            os.fsync(stream.fileno())
+    target.chmod(READ_ONLY)
+
+
+TEMPLATE: Sequence[tuple[str, str, Sequence[str]]] = (
+    ("DATUM_FILE", "datum", ("datum.yaml",)),
+    ("TMAP_FILE", "tmap2", ("network.tmap2.yaml",)),
+    ("COSTMAP_YAML_FILE", "occupancy_grid", ("map.yaml",)),
+    ("NOGO_COSTMAP_YAML_FILE", "occupancy_grid", ("nogo.yaml", "keepout.yaml")),
+    ("GAZEBO_WORLD_FILE", "gazebo", ("world.sdf",)),
+)
+"""environment_template's variables: name, format, file names in the order of preference."""
+
+
+def environment_sh(manifest: Manifest, current: Path) -> str:
+    """``environment.sh``: the environment_template's variables for the files that are there.
+
+    As in the template a variable is empty where its file is absent, so that sourcing it again leaves nothing stale. All
+    values are literals in single quotes: whoever names a file does not run anything.
+    """
+    there: dict[str, list[str]] = {}
+    for file in manifest.files:
+        there.setdefault(file.format, []).append(file.name)
+    values: dict[str, str] = {}
+    for variable, format_, wanted in TEMPLATE:
+        names = there.get(format_, [])
+        found = next((name for name in wanted if name in names), None)
+        if found is None and variable in ("TMAP_FILE", "GAZEBO_WORLD_FILE") and len(names) == 1:
+            found = names[0]
+        values[variable] = str(current / format_ / found) if found else ""
+    models = any(name.startswith("models/") for name in there.get("gazebo", ()))
+    values["GAZEBO_CUSTOM_MODELS"] = str(current / "gazebo" / "models") if models else ""
+    for variable, ending in (("POI_FILE", "poi.kml"), ("PROPERTIES_FILE", "properties.sh")):
+        found = next((file.path for file in manifest.files if file.path.rpartition("/")[2] == ending), None)
+        values[variable] = str(current / found) if found else ""
+    values |= {
+        "FLEETMAP_ENVIRONMENT": manifest.environment,
+        "FLEETMAP_VERSION": str(manifest.version),
+        "FLEETMAP_ROOT": manifest.root,
+        "FLEETMAP_CHANNEL": manifest.channel or "",
+        "FLEETMAP_CURRENT": str(current),
+    }
+    lines = [f"export {name}={shlex.quote(value)}" for name, value in values.items()]
+    if models:
+        lines.append('export GAZEBO_MODEL_PATH="${GAZEBO_MODEL_PATH:-}:$GAZEBO_CUSTOM_MODELS"')
+    return "# Written by `fleetmap agent` with each version; to be sourced.\n" + "\n".join(lines) + "\n"

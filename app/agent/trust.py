@@ -1,0 +1,231 @@
+"""What a robot believes: a manifest signed by the pinned key, of its environment and channel, fresh, never older.
+
+Attacks that this refuses, in the words of The Update Framework: rollback (a lower sequence), freeze (an expired
+manifest), mix-and-match (files of different versions: all hashes stand in one signed list), arbitrary bytes, and a
+foreign key. A new key is taken only with the endorsement of the pinned one.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+from app.errors import Untrusted
+
+CLOCKS_DIFFER = timedelta(seconds=60)
+"""How far a robot's clock may be from the server's."""
+
+MAX_FILES = 100_000
+_HASH = re.compile(r"[0-9a-f]{64}")
+_FORMAT = re.compile(r"[a-z0-9][a-z0-9_]{0,62}")
+_KEY_ID = re.compile(r"[0-9a-f]{16}")
+
+
+@dataclass(frozen=True, slots=True)
+class File:
+    """A file of a map. name: relative, with ``/`` between folders."""
+
+    format: str
+    name: str
+    size: int
+    sha256: str
+
+    @property
+    def path(self) -> str:
+        """Where it lies below ``current``."""
+        return f"{self.format}/{self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """A signed list of a version's files. data, signature: the signed bytes and the header, as they came."""
+
+    environment: str
+    channel: str | None
+    sequence: int
+    version: int
+    root: str
+    expires: datetime
+    files: tuple[File, ...]
+    data: bytes
+    signature: str
+
+    @property
+    def content(self) -> dict[str, str]:
+        """Path -> SHA-256: equal for equal maps."""
+        return {file.path: file.sha256 for file in self.files}
+
+
+def parse(data: bytes, signature: str) -> Manifest:
+    """The members of a manifest, each checked; Untrusted where they are not what a manifest has."""
+    try:
+        body = json.loads(data)
+        files = tuple(File(f["format"], f["name"], f["size"], f["sha256"]) for f in body["files"])
+        expires = datetime.fromisoformat(body["expires"])
+        found = Manifest(
+            body["environment"],
+            body.get("channel"),
+            body["sequence"],
+            body["version"],
+            body["root"],
+            expires,
+            files,
+            data,
+            signature,
+        )
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise Untrusted(f"the server's manifest cannot be read: {type(error).__name__}: {error}") from None
+    whole = all(type(n) is int and 0 <= n < 2**63 for n in (found.sequence, found.version, *(f.size for f in files)))
+    texts = all(isinstance(t, str) for t in (found.environment, found.channel or "", found.root))
+    hashes = texts and all(isinstance(h, str) and _HASH.fullmatch(h) for h in (found.root, *(f.sha256 for f in files)))
+    if not (whole and hashes) or expires.tzinfo is None or len(files) > MAX_FILES:
+        raise Untrusted("the server's manifest cannot be read: a number, a hash or the time of expiry is none")
+    _check_paths(files)
+    return found
+
+
+def _check_paths(files: Sequence[File]) -> None:
+    """No file leaves its folder, none is told twice, none is also a folder."""
+    seen: set[str] = set()
+    folders: set[str] = set()
+    for file in files:
+        known = isinstance(file.format, str) and _FORMAT.fullmatch(file.format)
+        pieces = file.name.split("/") if isinstance(file.name, str) else [""]
+        fine = known and all(p not in ("", ".", "..") and len(p.encode("utf-8", "replace")) <= 255 for p in pieces)
+        if not fine or "\\" in file.name or not file.name.isprintable() or file.path in seen:
+            raise Untrusted(f"the manifest names a file that cannot be: {file.format!r}/{file.name!r}")
+        seen.add(file.path)
+        parts = file.path.split("/")
+        folders |= {"/".join(parts[:n]) for n in range(1, len(parts))}
+    if both := sorted(seen & folders):
+        raise Untrusted(f"the manifest names a file that is a folder as well: {both[0]}")
+
+
+def key_id(public: bytes) -> str:
+    """The id of a raw public key."""
+    return hashlib.sha256(public).hexdigest()[:16]
+
+
+def signer(
+    data: bytes, signature: str, pinned: bytes | None, given: str | None, keys: Callable[[], list[Mapping[str, Any]]]
+) -> bytes:
+    """The raw public key that signed ``data``, if the robot may believe it: the pinned one, or one that it vouches for.
+
+    signature: ``<key id>:<base64>``. given: what the operator said to trust at first contact (id or raw key in base64).
+    keys: asks the server for its keys, the newest first; called only where the pinned key is not the one. Untrusted.
+    """
+    name, _, text = signature.partition(":")
+    signed = _bytes(text)
+    if not name or signed is None or len(signed) != 64:
+        raise Untrusted("the server's manifest is not signed")
+    if pinned is None and given is not None:
+        pinned = _bytes(given) if not _KEY_ID.fullmatch(given) else None
+    known = pinned is not None and key_id(pinned) == name
+    key = pinned if pinned is not None and known else _from_server(name, pinned, given, keys())
+    if not _verifies(key, signed, data):
+        raise Untrusted(f"the manifest's signature is not that of the key {name}: it was changed on its way")
+    return key
+
+
+def _from_server(name: str, pinned: bytes | None, given: str | None, keys: Sequence[Mapping[str, Any]]) -> bytes:
+    known: dict[str, tuple[bytes, Mapping[str, Any]]] = {}
+    for line in keys:
+        public = _bytes(str(line.get("public_key", "")))
+        if public is not None and len(public) == 32 and line.get("id") == key_id(public):
+            known[key_id(public)] = (public, line)
+    if name not in known:
+        raise Untrusted(f"the manifest is signed with the key {name}, which the server does not tell")
+    trusted = key_id(pinned) if pinned is not None else given
+    if trusted is None:
+        return known[name][0]  # first contact: whoever answers is believed, and only he from now on
+    at = name
+    for _ in range(len(known) + 1):
+        if at == trusted:
+            return known[name][0]
+        if at not in known:
+            break
+        public, line = known[at]
+        by = str(line.get("endorsed_by", ""))
+        voucher = pinned if pinned is not None and by == key_id(pinned) else known[by][0] if by in known else None
+        endorsement = _bytes(str(line.get("endorsement", "")))
+        if voucher is None or endorsement is None or not _verifies(voucher, endorsement, public):
+            break
+        at = by
+    raise Untrusted(
+        f"the manifest is signed with the key {name}, for which the trusted key {trusted} does not vouch. Is this "
+        "another server? If it is meant to be, say its key with --key and remove state.json"
+    )
+
+
+def check_given(text: str) -> str:
+    """A key as an operator writes it: its id (16 hexadecimal digits) or the raw public key in base64; Untrusted."""
+    text = text.strip()
+    raw = _bytes(text)
+    if _KEY_ID.fullmatch(text) or (raw is not None and len(raw) == 32):
+        return text
+    raise Untrusted("--key takes a key's id (16 hexadecimal digits) or its public_key in base64, as GET /api/v1/keys")
+
+
+def check(
+    manifest: Manifest,
+    *,
+    environment: str,
+    channel: str | None,
+    formats: Sequence[str],
+    mark: tuple[int, str] | None,
+    now: datetime | None = None,
+) -> None:
+    """Whether a signed manifest is the one that was asked for. mark: sequence and root of the newest one ever believed.
+
+    Raises Untrusted, with what an operator can do.
+    """
+    if manifest.environment != environment:
+        raise Untrusted(f"the manifest is of the environment {manifest.environment!r}, not of {environment!r}")
+    if manifest.channel != channel:
+        raise Untrusted(f"the manifest is of the channel {manifest.channel!r}, not of {channel!r}")
+    if manifest.expires + CLOCKS_DIFFER < (now or datetime.now(UTC)):
+        raise Untrusted(
+            f"the manifest has expired at {manifest.expires:%Y-%m-%d %H:%M:%S} UTC: somebody hands out an old one, or "
+            "a clock is wrong"
+        )
+    got = {file.format for file in manifest.files}
+    if got != set(formats):
+        missing, more = sorted(set(formats) - got), sorted(got - set(formats))
+        raise Untrusted(f"the manifest is of other formats: without {missing or 'none'}, with {more or 'no'} further")
+    if mark is None:
+        return
+    if manifest.sequence < mark[0]:
+        raise Untrusted(
+            f"the manifest has the sequence {manifest.sequence}, and {mark[0]} was seen already: somebody hands out an "
+            "old map. If the server was set up anew, remove state.json"
+        )
+    if manifest.sequence == mark[0] and manifest.root != mark[1]:
+        raise Untrusted(
+            f"the manifest of sequence {manifest.sequence} has the root {manifest.root[:8]}, and {mark[1][:8]} was "
+            "seen under the same number: there are two servers with one key. If it was restored, remove state.json"
+        )
+
+
+def _verifies(public: bytes, signature: bytes, data: bytes) -> bool:
+    try:
+        Ed25519PublicKey.from_public_bytes(public).verify(signature, data)
+    except (InvalidSignature, ValueError):
+        return False
+    return True
+
+
+def _bytes(text: str) -> bytes | None:
+    try:
+        return base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError):
+        return None

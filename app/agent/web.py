@@ -1,0 +1,317 @@
+"""HTTP to the server: the manifest, the keys, files with ranges and deltas (RFC 9110, RFC 9842), and the status."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import sys
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote, urljoin
+
+import httpx
+
+from app.agent.trust import File
+from app.errors import Denied, FleetMapError, Invalid, NotFound, Unavailable, Untrusted
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
+
+API = "/api/v1"
+SIGNATURE = "fleetmap-signature"
+TIMEOUT = httpx.Timeout(10.0, read=60.0)
+"""Seconds. A map that takes its server longer is answered with a job."""
+
+MAX_MANIFEST_BYTES = 32 * 2**20
+MAX_JSON_BYTES = 4 * 2**20
+MAX_DICTIONARY_BYTES = 64 * 2**20
+"""A larger file is fetched whole: it would be held in memory twice."""
+
+WINDOW_LOG = 27
+"""The largest window that a delta may ask for: 128 MiB."""
+
+DCZ_MAGIC = bytes.fromhex("5e2a4d1820000000")
+JOB_SECONDS = 600.0
+
+
+class Stopped(Exception):
+    """The agent was told to end."""
+
+
+class Busy(Unavailable):
+    """The server asks to come again after so many seconds."""
+
+    def __init__(self, detail: str, seconds: float = 0.0) -> None:
+        super().__init__(detail)
+        self.seconds = seconds
+
+
+class Web:
+    """A server, with one token. Methods raise FleetMapError where it says no, or nothing."""
+
+    def __init__(self, server: str, token: str | None, stopping: threading.Event) -> None:
+        self.server = (server if "://" in server else f"http://{server}").rstrip("/")
+        headers = {"User-Agent": "fleetmap-agent", "Accept-Encoding": "identity"}
+        if token:
+            headers["Authorization"] = f"Bearer {token}"
+        self._http = httpx.Client(base_url=self.server, headers=headers, timeout=TIMEOUT, follow_redirects=False)
+        self._stopping = stopping
+        self.received = 0
+        self.deltas = 0
+
+    def close(self) -> None:
+        """Let go of the connections."""
+        self._http.close()
+
+    # --- what is asked ---
+
+    def readyz(self) -> Any:
+        """What the server says of itself; members of ``events`` say where its router is."""
+        return self._json("/readyz")
+
+    def keys(self) -> list[Mapping[str, Any]]:
+        """The keys that sign, the newest first."""
+        found = self._json(f"{API}/keys")
+        return [line for line in found if isinstance(line, dict)] if isinstance(found, list) else []
+
+    def channels(self, environment: str) -> list[Mapping[str, Any]]:
+        """The channels with what is planned for them."""
+        found = self._json(f"{API}/environments/{quote(environment, safe='')}/channels")
+        return [line for line in found if isinstance(line, dict)] if isinstance(found, list) else []
+
+    def changed_layers(self, environment: str, old: int, new: int) -> list[str]:
+        """The layers that differ between two versions."""
+        path = f"{API}/environments/{quote(environment, safe='')}/diff?from={old}&to={new}"
+        found = self._json(path)
+        layers = found.get("layers", {}) if isinstance(found, dict) else {}
+        return sorted(str(name) for name, change in layers.items() if change)
+
+    def manifest(
+        self, environment: str, ref: str, formats: Iterable[str], etag: str | None = None
+    ) -> tuple[bytes, str, str | None] | None:
+        """The signed bytes, the signature, the ETag; None where it is still the one with ``etag``."""
+        asked = ",".join(quote(name, safe="") for name in formats)
+        path = (
+            f"{API}/environments/{quote(environment, safe='')}/versions/{quote(ref, safe='')}/manifest?formats={asked}"
+        )
+        headers = {"If-None-Match": etag} if etag else {}
+        while True:
+            with self._stream(path, headers) as answer:
+                if answer.status_code == 304 and etag:
+                    return None
+                if answer.status_code == 200:
+                    data = self._whole(answer, MAX_MANIFEST_BYTES)
+                    return data, answer.headers.get(SIGNATURE, ""), answer.headers.get("etag")
+                if answer.status_code != 202:
+                    raise self._refused(answer)
+                where = answer.headers.get("location", "")
+            self._wait(urljoin(path, where))
+
+    def put_status(self, robot: str, body: Mapping[str, Any]) -> None:
+        """Tell the robot's status."""
+        with self._reach():
+            answer = self._http.put(f"{API}/robots/{quote(robot, safe='')}/status", json=dict(body))
+        if answer.status_code >= 300:
+            raise self._refused(answer)
+
+    def fetch(self, environment: str, version: int, file: File, target: Path, old: tuple[Path, str] | None) -> None:
+        """A file into ``target``, whole and verified. What a break leaves in ``<target>.part`` is gone on from.
+
+        old: a file that is here, with its SHA-256, that the server may answer with the difference to. Untrusted where
+        the bytes are not those of the manifest.
+        """
+        path = f"{API}/environments/{quote(environment, safe='')}/versions/{version}/maps/"
+        path += f"{quote(file.format, safe='')}/{quote(file.name, safe='/')}"
+        part = target.with_name(target.name + ".part")
+        for _ in range(2):
+            fresh = not part.exists()
+            if part.exists() and part.stat().st_size > file.size:
+                part.unlink()
+            whole = self._receive(path, part, file, old if fresh else None)
+            if _complete(part, file):
+                part.chmod(0o444)
+                part.replace(target)
+                return
+            part.unlink(missing_ok=True)
+            if fresh and whole:
+                break
+            old = None  # a delta, or a part of before, that did not fit: once more from the start
+        raise Untrusted(f"{file.path} has other bytes than the manifest says: it was changed on its way")
+
+    # --- inside ---
+
+    def _receive(self, path: str, part: Path, file: File, old: tuple[Path, str] | None) -> bool:
+        """Write or go on writing ``part``: whether the server sent the whole file."""
+        start = part.stat().st_size if part.exists() else 0
+        if start == file.size and start:
+            return False
+        headers = {"Range": f"bytes={start}-"} if start else {}
+        if old is not None and not start and max(old[0].stat().st_size, file.size) <= MAX_DICTIONARY_BYTES:
+            dictionary = base64.b64encode(bytes.fromhex(old[1])).decode()
+            headers |= {"Available-Dictionary": f":{dictionary}:", "Accept-Encoding": "dcz"}
+        with self._stream(path, headers) as answer:
+            if answer.status_code == 416:
+                return False
+            if answer.status_code == 202:
+                raise Busy(f"the server is still making {file.path}", 2.0)
+            if answer.status_code not in (200, 206):
+                raise self._refused(answer)
+            coding = answer.headers.get("content-encoding", "identity").lower()
+            chunks = self._chunks(answer)
+            if coding == "dcz" and old is not None:
+                self._write(part, "wb", 0, _undo(chunks, old, file), file, keep=False)
+                self.deltas += 1
+                return False
+            if coding != "identity":
+                raise Unavailable(f"{file.path} came with Content-Encoding {coding}, which was not asked for")
+            going_on = answer.status_code == 206
+            self._write(part, "ab" if going_on else "wb", start if going_on else 0, chunks, file, keep=True)
+            return not going_on
+
+    @staticmethod
+    def _write(part: Path, mode: str, start: int, chunks: Iterable[bytes], file: File, *, keep: bool) -> None:
+        written = start
+        try:
+            with part.open(mode) as stream:
+                for chunk in chunks:
+                    written += len(chunk)
+                    if written > file.size:
+                        break  # more than the manifest says: the size no longer fits, which the caller finds
+                    stream.write(chunk)
+                stream.flush()
+                os.fsync(stream.fileno())
+        except BaseException:
+            if not keep:
+                part.unlink(missing_ok=True)
+            raise
+        if written > file.size:
+            part.unlink(missing_ok=True)
+
+    def _chunks(self, answer: httpx.Response) -> Iterator[bytes]:
+        for chunk in answer.iter_raw(1 << 16):
+            if self._stopping.is_set():
+                raise Stopped
+            self.received += len(chunk)
+            yield chunk
+
+    def _whole(self, answer: httpx.Response, limit: int) -> bytes:
+        data = bytearray()
+        for chunk in self._chunks(answer):
+            data += chunk
+            if len(data) > limit:
+                raise Untrusted(f"the answer has more than {limit} bytes")
+        return bytes(data)
+
+    def _json(self, path: str) -> Any:
+        with self._stream(path, {}) as answer:
+            if answer.status_code != 200:
+                raise self._refused(answer)
+            data = self._whole(answer, MAX_JSON_BYTES)
+        try:
+            return json.loads(data)
+        except (ValueError, RecursionError):
+            raise Unavailable(f"{self.server} does not answer as a Fleet Map Server: its answer is no JSON") from None
+
+    def _wait(self, where: str) -> None:
+        """Until a job is done; its problem where it fails."""
+        if not where.startswith("/"):
+            raise Unavailable(f"{self.server} names a job that is not its own")
+        pause, waited = 0.3, 0.0
+        while True:
+            job = self._json(where)
+            state = job.get("state") if isinstance(job, dict) else None
+            if state == "done":
+                return
+            if state not in ("queued", "running"):
+                problem = job.get("problem") if isinstance(job, dict) else None
+                detail = problem.get("detail") if isinstance(problem, dict) else state
+                raise Invalid(f"the server cannot make the maps: {detail}")
+            if waited > JOB_SECONDS:
+                raise Unavailable(f"the server has not made the maps within {JOB_SECONDS:g} seconds")
+            if self._stopping.wait(pause):
+                raise Stopped
+            waited += pause
+            pause = min(5.0, pause * 1.5)
+
+    @contextmanager
+    def _stream(self, path: str, headers: Mapping[str, str]) -> Iterator[httpx.Response]:
+        with self._reach(), self._http.stream("GET", path, headers=dict(headers)) as answer:
+            yield answer
+
+    @contextmanager
+    def _reach(self) -> Iterator[None]:
+        if self._stopping.is_set():
+            raise Stopped
+        try:
+            yield
+        except (httpx.TransportError, httpx.InvalidURL) as error:
+            raise Unavailable(f"no answer from {self.server}: {error or type(error).__name__}") from None
+
+    def _refused(self, answer: httpx.Response) -> FleetMapError:
+        """The server's problem as an error of ours."""
+        status, detail = answer.status_code, ""
+        try:
+            data = answer.content if answer.is_closed else self._whole(answer, MAX_JSON_BYTES)
+            problem = json.loads(data)
+            detail = str(problem.get("detail") or problem.get("title") or "") if isinstance(problem, dict) else ""
+        except (ValueError, RecursionError, httpx.HTTPError, FleetMapError):
+            detail = ""
+        detail = detail[:1000] or f"{self.server} answered {status}"
+        if status in (429, 503):
+            try:
+                seconds = float(answer.headers.get("retry-after", "0"))
+            except ValueError:
+                seconds = 0.0
+            return Busy(detail, min(300.0, max(0.0, seconds)))
+        if status in (401, 403):
+            return Denied(f"{detail} (token: FLEETMAP_TOKEN)")
+        if status == 404:
+            return NotFound(detail)
+        return Unavailable(detail) if status >= 500 else Invalid(detail)
+
+
+def _complete(part: Path, file: File) -> bool:
+    try:
+        if part.stat().st_size != file.size:
+            return False
+        with part.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest() == file.sha256
+    except FileNotFoundError:
+        return False
+
+
+def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: File) -> Iterator[bytes]:
+    """The new file of a ``dcz`` body, in pieces; never much more than the manifest's size."""
+    where, digest = old
+    want = DCZ_MAGIC + bytes.fromhex(digest)
+    head = b""
+    for chunk in chunks:
+        head += chunk
+        if len(head) >= len(want):
+            break
+    if head[: len(want)] != want:
+        raise Untrusted(f"{file.path}: the delta is not one to the file that is here")
+    decoder = zstd.ZstdDecompressor(
+        zstd.ZstdDict(where.read_bytes(), is_raw=True).as_prefix,
+        options={zstd.DecompressionParameter.window_log_max: WINDOW_LOG},
+    )
+    made = 0
+    data: bytes | None = head[len(want) :]
+    try:
+        while data is not None and not decoder.eof:
+            out = decoder.decompress(data, max_length=1 << 20)
+            made += len(out)
+            if made > file.size:
+                raise Untrusted(f"{file.path}: the delta unfolds to more bytes than the manifest says")
+            if out:
+                yield out
+            data = b"" if not decoder.needs_input else next(chunks, None)
+    except zstd.ZstdError as error:
+        raise Untrusted(f"{file.path}: the delta cannot be read: {error}") from None

@@ -1,0 +1,125 @@
+"""The robot's side: a folder that always holds the channel's map, whole and verified."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+
+from app.cli import options, output
+
+
+def agent(
+    environment: Annotated[str, typer.Option("--environment", "-e", help="Name of the environment.")],
+    formats: Annotated[str, typer.Option("--formats", "-f", help="Formats to keep, separated by commas.")],
+    into: Annotated[Path, typer.Option("--into", "-o", help="Folder; the maps are in its `current/<format>/`.")],
+    channel: Annotated[
+        str | None, typer.Option("--channel", help="Channel to follow [default: production if it exists, else latest].")
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option("--robot", envvar="FLEETMAP_ROBOT", help="Name of the robot [default: this host's].")
+    ] = None,
+    on_change: Annotated[
+        list[str] | None,
+        typer.Option("--on-change", help="Command to run after a change, or `nav2`, `topological`; repeatable."),
+    ] = None,
+    key: Annotated[
+        str | None,
+        typer.Option(
+            "--key",
+            envvar="FLEETMAP_AGENT_KEY",
+            help="The server's key to trust: its id or public_key [default: the one of the first contact].",
+        ),
+    ] = None,
+    poll: Annotated[
+        float, typer.Option("--poll", min=0.1, help="Seconds between polls, give or take a half; events come at once.")
+    ] = 60.0,
+    zenoh_connect: Annotated[
+        str | None,
+        typer.Option("--zenoh", envvar="FLEETMAP_ZENOH_CONNECT", help="Zenoh router [default: the server tells it]."),
+    ] = None,
+    zenoh_prefix: Annotated[
+        str | None, typer.Option("--zenoh-prefix", envvar="FLEETMAP_ZENOH_PREFIX", help="Start of every key.")
+    ] = None,
+    zenoh_config: Annotated[
+        Path | None,
+        typer.Option("--zenoh-config", envvar="FLEETMAP_ZENOH_CONFIG", help="Zenoh's own JSON5: TLS, user, password."),
+    ] = None,
+    once: Annotated[bool, typer.Option("--once", help="Bring the folder up to date once, and end.")] = False,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for all that happens.")] = False,
+) -> None:
+    """Keep a folder at the channel's map, on a robot.
+
+    It listens for events, fetches what differs, verifies signature and hashes, and switches `current` at once. It goes
+    on without a server or a network, and reports how the robot is.
+    """
+    from app.agent.core import Agent, Options, robot_name
+    from app.cli.client import DEFAULT_SERVER
+    from app.errors import Invalid
+
+    names = tuple(dict.fromkeys(part.strip() for part in formats.split(",") if part.strip()))
+    if not names:
+        raise Invalid("--formats needs one format or several, separated by commas: occupancy_grid,tmap2")
+
+    def tell(what: str, **members: Any) -> None:
+        if as_json:
+            time = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+            sys.stdout.write(json.dumps({"time": time, "event": what, **members}, ensure_ascii=False) + "\n")
+            sys.stdout.flush()
+        else:
+            style = "red" if what in ("failed", "refused", "damaged") else None
+            output.say(f"{what}: {_line(members)}", style=style)
+
+    agent = Agent(
+        Options(
+            server=server or DEFAULT_SERVER,
+            environment=environment,
+            formats=names,
+            into=into,
+            channel=channel,
+            robot=robot_name(robot),
+            on_change=tuple(on_change or ()),
+            token=token or None,
+            key=key or None,
+            poll_seconds=poll,
+            zenoh_connect=zenoh_connect or None,
+            zenoh_prefix=zenoh_prefix or None,
+            zenoh_config=zenoh_config,
+        ),
+        tell,
+    )
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        agent.stop()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, stop)
+    try:
+        agent.open()
+        if once:
+            if not agent.once():
+                raise typer.Exit(1)
+        else:
+            agent.run()
+    finally:
+        agent.close()
+
+
+def _line(members: dict[str, Any]) -> str:
+    """What happened, for people: the detail last, hashes short."""
+    words = []
+    for name, value in members.items():
+        if value in (None, "") or name == "detail":
+            continue
+        words.append(f"{name} {value[:8] if name == 'root' else value}")
+    head = ", ".join(words)
+    detail = str(members.get("detail") or "")
+    return f"{head}: {detail}" if head and detail else head or detail

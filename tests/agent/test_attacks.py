@@ -1,0 +1,311 @@
+"""Whoever stands between a robot and its server, or in its place, cannot make the robot take a wrong or an old map."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from backports import zstd
+
+from app.agent import trust
+from app.agent.core import Agent, Options
+from app.errors import Untrusted
+from app.signing import Keys, key_id
+from tests.agent.conftest import Gate, network, whole
+from tests.api.conftest import ADMIN, Api
+
+SIGNATURE = "fleetmap-signature"
+Changed = tuple[int, dict[str, str], bytes]
+Change = Callable[[str, int, dict[str, str], bytes], Changed]
+
+
+class Once:
+    """``fleetmap agent --once`` within this process: there are many attacks."""
+
+    def __init__(self, server: str, env: str, into: Path, key: str | None = None) -> None:
+        self.into = into
+        self.lines: list[dict[str, Any]] = []
+        agent = Agent(
+            Options(
+                server=server, environment=env, formats=("tmap2",), into=into, robot=into.name, token=ADMIN, key=key
+            ),
+            lambda what, **members: self.lines.append({"event": what, **members}),
+        )
+        try:
+            agent.open()
+            self.good = agent.once()
+        finally:
+            agent.close()
+
+    def saw(self, event: str, **members: Any) -> dict[str, Any] | None:
+        fits = (x for x in self.lines if x["event"] == event and all(x.get(k) == v for k, v in members.items()))
+        return next(fits, None)
+
+
+Start = Callable[..., Once]
+
+
+@pytest.fixture
+def robot(api: Api, place: str, tmp_path: Path) -> Start:
+    """Sync once."""
+
+    def start(*, server: str | None = None, name: str = "robot", key: str | None = None) -> Once:
+        return Once(server or api.url, place, tmp_path / name, key)
+
+    return start
+
+
+@pytest.fixture
+def keys(api: Api, folder: Path) -> Keys:
+    """The server's own keys: what a signed manifest is made with."""
+    api.get("keys")
+    return Keys(folder / "keys")
+
+
+def signed(keys: Keys, **members: Any) -> Change:
+    """Manifests with other members, signed."""
+
+    def change(path: str, status: int, headers: dict[str, str], body: bytes) -> Changed:
+        if "/manifest" not in path or status != 200:
+            return status, headers, body
+        data = json.dumps({**json.loads(body), **members}).encode()
+        key, signature = keys.sign(data)
+        return 200, {**headers, SIGNATURE: f"{key}:{base64.b64encode(signature).decode()}"}, data
+
+    return change
+
+
+def on(part: str, change: Callable[[bytes], bytes]) -> Change:
+    """Other bodies at some addresses."""
+
+    def apply(path: str, status: int, headers: dict[str, str], body: bytes) -> Changed:
+        return status, headers, change(body) if part in path and status == 200 else body
+
+    return apply
+
+
+def attacked(robot: Start, gate: Gate, *, word: str, holds: int | None = 1, **rest: Any) -> None:
+    """An agent that must refuse: it says why, tells the server, and what stood stands."""
+    gate.statuses.clear()
+    one = robot(server=gate.url, **rest)
+    assert not one.good, one.lines
+    said = one.saw("refused")
+    assert said, one.lines
+    assert word in said["detail"], said
+    assert gate.statuses[-1]["state"] == "failed"
+    assert word in gate.statuses[-1]["detail"]
+    if holds is None:
+        assert not (one.into / "current").exists()
+    else:
+        assert whole(one.into)["version"] == holds
+        assert gate.statuses[-1]["version"] == holds
+
+
+@pytest.fixture
+def held(api: Api, place: str, robot: Start, gate: Gate) -> str:
+    """A robot that holds version 1, and a server that has version 2."""
+    assert robot(server=gate.url).good
+    api.upload(place, {"n.tmap2.yaml": network(1)})
+    return place
+
+
+def recover(robot: Start, gate: Gate) -> None:
+    """Without the attack all is well at once."""
+    gate.change = None
+    one = robot(server=gate.url)
+    assert one.good, one.lines
+    assert whole(one.into)["version"] == 2
+
+
+def test_an_old_manifest_is_refused(api: Api, held: str, robot: Start, gate: Gate) -> None:
+    path = f"environments/{held}/versions/latest/manifest?formats=tmap2"
+    gate_open = robot(server=gate.url)
+    assert gate_open.good
+    before = api.get(path)
+    api.upload(held, {"n.tmap2.yaml": network(2)})
+    assert robot(server=gate.url).good
+
+    def replay(path: str, status: int, headers: dict[str, str], body: bytes) -> Changed:
+        if "/manifest" not in path:
+            return status, headers, body
+        return 200, dict(before.headers), before.content
+
+    gate.change = replay
+    attacked(robot, gate, word="sequence 3, and 4 was seen", holds=3)
+
+
+@pytest.mark.parametrize(
+    ("members", "word"),
+    [
+        ({"expires": "2020-01-01T00:00:00Z"}, "expired"),
+        ({"expires": (datetime.now(UTC) - timedelta(seconds=200)).isoformat()}, "expired"),
+        ({"environment": "elsewhere"}, "of the environment 'elsewhere'"),
+        ({"channel": "staging"}, "of the channel 'staging'"),
+        ({"channel": None}, "of the channel None"),
+        ({"sequence": 1, "root": "0" * 64}, "was seen"),
+        ({"sequence": -1}, "cannot be read"),
+        ({"sequence": True}, "cannot be read"),
+        ({"root": "x"}, "cannot be read"),
+        ({"expires": "2990-01-01T00:00:00"}, "cannot be read"),
+        ({"files": []}, "without ['tmap2']"),
+        ({"files": [{"format": "tmap2", "name": "../../../x", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
+        ({"files": [{"format": "tmap2", "name": "/etc/x", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
+        ({"files": [{"format": "..", "name": "x", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
+        ({"files": [{"format": "tmap2", "name": "a\nb", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
+        ({"files": [{"format": "tmap2", "name": "x", "size": 1, "sha256": "../../x"}]}, "cannot be read"),
+        ({"files": [{"format": "tmap2", "name": n, "size": 1, "sha256": "0" * 64} for n in ("a", "a/b")]}, "folder"),
+        ({"files": 7}, "cannot be read"),
+    ],
+)  # fmt: skip
+def test_a_manifest_that_does_not_fit_is_refused(
+    held: str, robot: Start, gate: Gate, keys: Keys, members: dict[str, Any], word: str
+) -> None:
+    gate.change = signed(keys, **members)
+    attacked(robot, gate, word=word)
+
+
+def test_after_an_attack_all_is_well(held: str, robot: Start, gate: Gate, keys: Keys) -> None:
+    gate.change = signed(keys, expires="2020-01-01T00:00:00Z")
+    attacked(robot, gate, word="expired")
+    recover(robot, gate)
+
+
+def test_a_minute_between_clocks_is_no_attack(held: str, robot: Start, gate: Gate, keys: Keys) -> None:
+    gate.change = signed(keys, expires=(datetime.now(UTC) - timedelta(seconds=20)).isoformat())
+    assert robot(server=gate.url).good
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (on("/manifest", lambda body: body.replace(b'"version":2', b'"version":9')), "changed on its way"),
+        (on("/manifest", lambda _: b"x"), "changed on its way"),
+        (lambda p, s, h, b: (s, {k: v for k, v in h.items() if k != SIGNATURE}, b), "not signed"),
+    ],
+)
+def test_what_is_not_signed_is_refused(held: str, robot: Start, gate: Gate, change: Change, word: str) -> None:
+    gate.change = change
+    attacked(robot, gate, word=word)
+    recover(robot, gate)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda b: b[:-2] + b"x\n", lambda b: b + b"x", lambda b: b[:-1], lambda _: b"", lambda b: b * 50],
+    ids=["other", "more", "less", "nothing", "much more"],
+)
+def test_wrong_bytes_are_refused(held: str, robot: Start, gate: Gate, change: Callable[[bytes], bytes]) -> None:
+    gate.deltas = False
+    gate.change = on("/maps/", change)
+    attacked(robot, gate, word="other bytes than the manifest says")
+    recover(robot, gate)
+
+
+def test_a_poisoned_delta_is_refused(held: str, robot: Start, gate: Gate) -> None:
+    head: list[bytes] = []
+
+    def bomb(path: str, status: int, headers: dict[str, str], body: bytes) -> Changed:
+        if headers.get("content-encoding") != "dcz":
+            return status, headers, body
+        head.append(body[:40])
+        return status, headers, body[:40] + zstd.compress(bytes(2**30))
+
+    gate.change = bomb
+    attacked(robot, gate, word="unfolds to more bytes")
+    gate.change = lambda p, s, h, b: (s, h, b[:40] + b"nonsense" if h.get("content-encoding") == "dcz" else b)
+    attacked(robot, gate, word="cannot be read")
+    gate.change = lambda p, s, h, b: (s, h, b"x" * 60 if h.get("content-encoding") == "dcz" else b)
+    attacked(robot, gate, word="not one to the file that is here")
+    assert head
+    recover(robot, gate)
+
+
+def test_a_foreign_key_is_refused(held: str, robot: Start, gate: Gate, tmp_path: Path) -> None:
+    foreign = Keys(tmp_path / "foreign")
+    sign = signed(foreign)
+
+    def change(path: str, status: int, headers: dict[str, str], body: bytes) -> Changed:
+        if path.endswith("/keys"):
+            own = foreign.public()[0].as_dict()
+            endorsed = {"endorsed_by": json.loads(body)[0]["id"], "endorsement": base64.b64encode(bytes(64)).decode()}
+            return 200, headers, json.dumps([{**own, **endorsed}, *json.loads(body)]).encode()
+        return sign(path, status, headers, body)
+
+    gate.change = change
+    attacked(robot, gate, word="does not vouch")
+    gate.change = sign
+    attacked(robot, gate, word="which the server does not tell")
+    recover(robot, gate)
+
+
+def test_a_rotated_key_is_followed_and_the_old_one_forgotten(
+    api: Api, held: str, robot: Start, gate: Gate, keys: Keys
+) -> None:
+    old = api.get(f"environments/{held}/versions/latest/manifest?formats=tmap2")
+    api.post("keys")
+    api.post("keys")
+    one = robot(server=gate.url)
+    assert one.good, one.lines
+    assert one.saw("trusting", detail="rotated")
+    assert whole(one.into)["version"] == 2
+    gate.change = lambda p, s, h, b: (200, dict(old.headers), old.content) if "/manifest" in p else (s, h, b)
+    attacked(robot, gate, word="does not vouch", holds=2)
+
+
+def test_the_key_can_be_given(api: Api, place: str, robot: Start, gate: Gate) -> None:
+    told = api.get("keys").json()[0]
+    attacked(robot, gate, key="0" * 16, word="does not vouch", holds=None)
+    other = base64.b64encode(bytes(range(32))).decode()
+    attacked(robot, gate, key=other, word="does not vouch", holds=None)
+    assert robot(key=told["id"], name="by-id").good
+    assert robot(key=told["public_key"], name="by-key").good
+    with pytest.raises(Untrusted, match="--key takes"):
+        robot(key="nonsense", name="wrong")
+
+
+def test_it_asks_anew_where_its_manifest_has_expired(api: Api, place: str, robot: Start, gate: Gate) -> None:
+    one = robot(server=gate.url)
+    assert one.good
+
+    def asked() -> list[bool]:
+        gate.requests.clear()
+        assert robot(server=gate.url).good
+        return ["if-none-match" in sent for _, path, sent, _ in gate.requests if "/manifest" in path]
+
+    assert asked() == [True]
+    state = json.loads((one.into / "state.json").read_text())
+    (one.into / "state.json").write_text(json.dumps({**state, "expires": 1.0}))
+    assert asked() == [False], "else a 304 for ever would hold back all changes"
+
+
+def test_the_token_is_not_told(place: str, robot: Start, gate: Gate) -> None:
+    one = robot(server=gate.url)
+    assert one.good
+    for path in one.into.rglob("*"):
+        assert path.is_dir() or ADMIN.encode() not in path.read_bytes()
+    assert ADMIN not in str(one.lines)
+
+
+def test_endorsements_are_followed_back_to_the_trusted_key(tmp_path: Path) -> None:
+    keys = Keys(tmp_path)
+    first = keys.public()[0]
+    keys.rotate()
+    keys.rotate()
+    name, signature = keys.sign(b"data")
+    header = f"{name}:{base64.b64encode(signature).decode()}"
+    listed = [k.as_dict() for k in keys.public()]
+    key = trust.signer(b"data", header, first.public, None, lambda: listed)
+    assert key_id(key) == name == keys.public()[0].id
+    assert trust.signer(b"data", header, None, first.id, lambda: listed) == key
+    assert trust.signer(b"data", header, None, base64.b64encode(first.public).decode(), lambda: listed) == key
+    for left in (0, 1):  # a link of the chain is missing
+        with pytest.raises(Untrusted, match=r"vouch|does not tell"):
+            trust.signer(b"data", header, first.public, None, lambda n=left: listed[:n] + listed[n + 1 :])
+    circle = [{**listed[0], "endorsed_by": listed[0]["id"]}]
+    with pytest.raises(Untrusted, match="vouch"):
+        trust.signer(b"data", header, first.public, None, lambda: circle)

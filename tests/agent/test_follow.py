@@ -1,0 +1,207 @@
+"""A robot follows its channel: first sync, events, deltas, hooks, offline."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from pathlib import Path
+
+from tests.agent.conftest import Gate, Robot, Start, network, whole
+from tests.api import samples
+from tests.api.conftest import Api
+
+
+def test_the_first_sync(api: Api, place: str, robot: Start) -> None:
+    api.upload(place, samples.grid())
+    one = robot("--once", formats="tmap2,occupancy_grid")
+    assert one.end() == 0, one.lines
+    manifest = one.standing
+    assert (manifest["version"], manifest["channel"]) == (2, "latest")
+    assert one.saw("following", channel="latest")
+    for file in manifest["files"]:
+        path = f"/maps/{place}/{file['format']}/{file['name']}"
+        assert one.file(f"{file['format']}/{file['name']}") == api.get(path).content
+    again = robot("--once", formats="tmap2,occupancy_grid")
+    assert again.end() == 0
+    assert again.saw("switched") is None, "nothing changed"
+
+
+def test_a_change_is_there_within_seconds_by_event_and_as_a_delta(api: Api, place: str, robot: Start) -> None:
+    one = robot("--poll", "3600")
+    one.wait("active", version=1)
+    one.wait("connected")
+    before = one.file()
+    begun = time.monotonic()
+    api.upload(place, {"n.tmap2.yaml": network(0.25)})
+    switched = one.wait("switched", 10, version=2)
+    took = time.monotonic() - begun
+    assert took < 5, f"{took:.1f} s: with polls only it would be half an hour"
+    assert one.file() == api.get(f"/maps/{place}/tmap2/network.tmap2.yaml").content != before
+    assert switched["deltas"] == 1
+    assert switched["bytes"] < 1500 < len(before) / 50, "the manifest and the delta"
+    assert one.stop() == 0
+
+
+def test_unchanged_files_are_linked_and_old_versions_go(api: Api, place: str, robot: Start) -> None:
+    api.upload(place, samples.grid())
+    formats = "tmap2,occupancy_grid"
+    first = robot("--once", formats=formats)
+    assert first.end() == 0
+    grid = first.into / "current" / "occupancy_grid" / "map.pgm"
+    inode = grid.stat().st_ino
+    for moved in (1, 2, 3, 4):
+        api.upload(place, {"n.tmap2.yaml": network(moved)})
+        assert robot("--once", formats=formats).end() == 0
+    assert grid.stat().st_ino == inode
+    names = sorted(p.name.split("-")[0] for p in (first.into / "versions").iterdir())
+    assert names == ["4", "5", "6"]
+    assert list((first.into / "partial").iterdir()) == []
+
+
+def test_production_goes_first_and_a_rollback_is_followed(api: Api, place: str, robot: Start) -> None:
+    one = robot("--poll", "3600")
+    one.wait("active", version=1)
+    one.wait("connected")
+    api.upload(place, {"n.tmap2.yaml": network(1)})
+    one.wait("active", version=2, channel="latest")
+    api("PUT", f"environments/{place}/channels/production", 200, json={"version": 2})
+    one.wait("active", version=2, channel="production")
+    count = len(one.lines)
+    api("PUT", f"environments/{place}/channels/production", 200, json={"version": 1})
+    one.wait("active", after=count, version=1, channel="production")
+    assert one.standing["version"] == 1
+    assert one.standing["sequence"] == 5
+    api.upload(place, {"n.tmap2.yaml": network(2)})  # latest is not of its concern any more
+    time.sleep(1)
+    assert one.standing["version"] == 1
+    assert one.stop() == 0
+
+
+def test_a_planned_move_is_preloaded(api: Api, place: str, robot: Start) -> None:
+    api("PUT", f"environments/{place}/channels/production", 200, json={"version": 1})
+    api.upload(place, {"n.tmap2.yaml": network(1)})
+    one = robot("--poll", "3600")
+    one.wait("active", version=1)
+    one.wait("connected")
+    at = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(time.time() + 6))
+    api("PUT", f"environments/{place}/channels/production", 200, json={"version": 2, "activate_at": at})
+    one.wait("ready", version=2)
+    assert one.standing["version"] == 1
+    switched = one.wait("switched", version=2)
+    assert switched["bytes"] < 1500, "the manifest only"
+    assert one.stop() == 0
+
+
+def test_a_missing_channel_is_told(api: Api, place: str, robot: Start) -> None:
+    one = robot("--once", "--channel", "staging")
+    assert one.end() == 1
+    assert "staging" in one.wait("failed")["detail"]
+
+
+def test_offline_start_keeps_the_map(api: Api, place: str, robot: Start, gate: Gate) -> None:
+    assert robot("--once", server=gate.url).end() == 0
+    gate.open = False
+    one = robot("--poll", "1", server=gate.url)
+    one.wait("holding", version=1)
+    assert "no answer" in one.wait("failed")["detail"]
+    assert whole(one.into)["version"] == 1
+    api.upload(place, {"n.tmap2.yaml": network(1)})
+    gate.open = True
+    one.wait("active", version=2)
+    assert one.stop() == 0
+
+
+def test_a_damaged_file_is_healed(api: Api, place: str, robot: Start) -> None:
+    one = robot("--once")
+    assert one.end() == 0
+    path = one.into / "current" / "tmap2" / "network.tmap2.yaml"
+    path.chmod(0o644)
+    path.write_bytes(b"x" + path.read_bytes()[1:])
+    again = robot("--once")
+    assert again.end() == 0
+    assert again.saw("damaged", version=1)
+    assert whole(one.into)["version"] == 1
+
+
+def test_other_formats_are_another_folder(api: Api, place: str, robot: Start) -> None:
+    assert robot("--once").end() == 0
+    one = robot("--once", formats="tmap2,navgraph")
+    assert one.end() == 0
+    assert {f["format"] for f in one.standing["files"]} == {"tmap2", "navgraph"}
+
+
+def test_one_folder_has_one_agent_and_one_environment(api: Api, place: str, robot: Start) -> None:
+    one = robot("--poll", "3600")
+    one.wait("active")
+    other = robot("--once")
+    assert other.end() == 1
+    assert "another agent" in str(other.lines)
+    assert one.stop() == 0
+    other = robot("--once", env="elsewhere")
+    assert other.end() == 1
+    assert "not of elsewhere" in str(other.lines)
+
+
+def test_the_hook_has_what_changed(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
+    told = tmp_path / "told"
+    command = f'env | grep ^FLEETMAP_ > {told}.new; cat "$FLEETMAP_CURRENT"/tmap2/* > /dev/null && mv {told}.new {told}'
+    one = robot("--poll", "3600", "--on-change", command)
+    one.wait("hook", version=1)
+    one.wait("connected")
+    api.upload(place, {"n.tmap2.yaml": network(1)})
+    one.wait("hook", version=2)
+    said = told.read_text()
+    assert f"FLEETMAP_ENVIRONMENT={place}\n" in said
+    assert "FLEETMAP_VERSION=2\n" in said
+    assert f"FLEETMAP_ROOT={one.standing['root']}\n" in said
+    assert "FLEETMAP_CHANNEL=latest\n" in said
+    assert f"FLEETMAP_CURRENT={one.into}/current\n" in said
+    assert "FLEETMAP_CHANGED=tmap2/network.tmap2.yaml\n" in said
+    assert "FLEETMAP_LAYERS=topology\n" in said
+    assert one.stop() == 0
+
+
+def test_layers_are_asked_for_where_no_event_tells_them(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
+    command = f"echo $FLEETMAP_LAYERS > {tmp_path}/layers"
+    assert robot("--once", "--on-change", command).end() == 0
+    api.upload(place, {"n.tmap2.yaml": network(1)})
+    api.upload(place, samples.grid())
+    assert robot("--once", "--on-change", command).end() == 0
+    assert (tmp_path / "layers").read_text() == "occupancy topology\n"
+
+
+def test_a_failing_hook_is_told_and_tried_again(api: Api, place: str, robot: Start, tmp_path: Path) -> None:
+    one = robot("--poll", "1", "--on-change", f"test -e {tmp_path}/fine || {{ echo no ROS here; exit 3; }}")
+    detail = one.wait("failed")["detail"]
+    assert "ended with 3: no ROS here" in detail
+    assert one.standing["version"] == 1
+    (tmp_path / "fine").touch()
+    one.wait("active", version=1)
+    assert one.stop() == 0
+
+
+def test_environment_sh(api: Api, place: str, robot: Start) -> None:
+    api.upload(place, samples.grid())
+    one = robot("--once", formats="tmap2,occupancy_grid")
+    assert one.end() == 0
+    script = 'set -eu; . "$1"; echo "$TMAP_FILE|$COSTMAP_YAML_FILE|$DATUM_FILE|$FLEETMAP_VERSION"'
+    told = subprocess.run(
+        ["sh", "-c", script, "sh", one.into / "current" / "environment.sh"], capture_output=True, text=True, check=True
+    ).stdout
+    current = one.into / "current"
+    assert told == f"{current}/tmap2/network.tmap2.yaml|{current}/occupancy_grid/map.yaml||2\n"
+
+
+def test_two_robots_hold_the_same_root(api: Api, place: str, robot: Start) -> None:
+    robots: list[Robot] = [robot("--poll", "3600", name=f"robot-{k}") for k in (1, 2)]
+    for one in robots:
+        one.wait("connected")
+        one.wait("active", version=1)
+    for moved in range(1, 6):
+        api.upload(place, {"n.tmap2.yaml": network(moved)})
+    for one in robots:
+        one.wait("active", version=6)
+    assert len({json.dumps(one.standing["files"]) + one.standing["root"] for one in robots}) == 1
+    for one in robots:
+        assert one.stop() == 0
