@@ -10,8 +10,8 @@ plain scalar means follows PyYAML (YAML 1.1), which the robots' own tools use, w
 
 Two ways lead to the same values: large generated files consist of few different lines in plain block layout, so
 ``_load_lines`` understands each distinct line once and puts the rest together at dictionary speed (several times
-faster than any general parser); whatever it does not know, and every error, is left to ``_load_events``, which builds
-the values from libyaml's events. Tests hold that both agree.
+faster than any general parser), also collections in flow style that end with their line; whatever it does not know,
+and every error, is left to ``_load_events``, which builds the values from libyaml's events. Tests hold that both agree.
 
 Refused, each with its line: NaN and infinities, integers beyond 64 bit, duplicate keys, ``<<``, tags other than
 YAML's own scalars and collections, ``%TAG``, a second document, nesting deeper than ``Limits.yaml_depth``, more than
@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -79,7 +80,8 @@ def load(data: bytes, limits: Limits, *, tags: Sequence[str] = (), typed: bool =
 
     tags: prefixes of the format's own tags, which collections may carry. typed: whether scalars get their meaning;
     if not, all are texts, those without quotes ``Plain``.
-    Values behind aliases are shared objects: do not change them in place. Raises UnreadableFile or TooLarge, with line.
+    Values behind aliases, and equal mappings at the end of rows in flow style, are shared objects: do not change them
+    in place. Raises UnreadableFile or TooLarge, with line.
     """
     if len(data) > limits.text_bytes:
         raise TooLarge(f"the file has {len(data)} bytes of YAML; the limit is {limits.text_bytes}")
@@ -355,6 +357,35 @@ _USUAL = re.compile(r"( *)([A-Za-z_]\w{0,200}): (?:(-?[0-9]{1,16}\.[0-9]{1,24})|
 
 _BLANK = re.compile(rf" *(?:#[ -~{_WIDE}]*)?\Z")
 
+_FLOW_LINE = re.compile(
+    rf"""(?P<indent>\ *+)
+    (?:
+        (?P<dash>-\ )(?=[\[{{])
+      | (?P<dashed>-\ )?(?P<key>[A-Za-z_][A-Za-z_0-9]{{0,200}}):\ (?=[\[{{])
+    )
+    (?P<flow>(?!\[\]|\{{\}})[\[{{][ -~{_WIDE}]*[\]}}])\Z""",
+    re.VERBOSE,
+)
+"""``- [1, 2, {key: value}]`` or ``key: {…}``: a collection in flow style that ends with its line."""
+
+_NUMBER = r"-?(?:0|[1-9][0-9]{0,15})(?:\.[0-9]{1,24})?"
+_ROW = re.compile(rf"( *)- \[({_NUMBER}), ({_NUMBER}), (.*)\Z", re.ASCII)
+_PLACE = re.compile(rf"({_NUMBER}), (?:([A-Za-z_]\w*)|(?:''|\"\"))\]\Z", re.ASCII)
+"""What most rows begin with, and what many end with."""
+
+_PLAIN_IN_FLOW = rf"(?:[A-Za-z_0-9$/(.~]|[-+](?=[0-9.]))(?:[ \w./$+()*|%@&=^<>;'\-{_WIDE}]*(?<!\ ))?"
+_FLOW = re.compile(
+    rf"""
+    (?P<key> (?:{_PLAIN_IN_FLOW}) (?=:\ ) | '[ -&(-~{_WIDE}]{{1,200}}'(?=:\ ) | "[ !\#-\[\]-~{_WIDE}]{{1,200}}"(?=:\ ) )
+  | (?P<plain>{_PLAIN_IN_FLOW}) (?=[,\]}}])
+  | '(?P<single>(?:[ -&(-~{_WIDE}] | '')*)' (?=[,\]}}])
+  | "(?P<double>[ !\#-\[\]-~{_WIDE}]*)" (?=[,\]}}])
+  | (?P<open>[\[{{])
+    """,
+    re.VERBOSE | re.ASCII,
+)
+"""What stands in a collection in flow style, before ``: `` (a key) or a comma or bracket (a scalar)."""
+
 _OPEN = object()
 """Nothing stands behind the colon or the dash: what it is shows on the next lines."""
 
@@ -370,10 +401,138 @@ _Line = tuple[int, str | None, Any, tuple[int, bool, int, str | None]]
 else -2; key; value; (first column, dash?, column of the key, anchor) for the general case."""
 
 
+class _Flows:
+    """Collections in flow style on one line. Equal mappings at the end of rows are one object, as behind aliases.
+
+    nodes: how many were said, shared ones each time; depth: of the deepest collection.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.nodes = self.depth = 0
+        self._limits = limits
+        self._known: dict[str, tuple[Any, int, int]] = {}
+
+    def row(self, x: str, y: str, tail: str) -> list[Any]:
+        """The value of ``[x, y, tail``, x and y being plain decimals."""
+        out: list[Any] = [float(x) if "." in x else int(x), float(y) if "." in y else int(y)]
+        place = _PLACE.match(tail)
+        if place:
+            third, name = place.groups()
+            out += (float(third) if "." in third else int(third), CONSTANTS.get(name, name) if name else "")
+            self._count(5, 1)
+        else:
+            rest, nodes, depth = self._collection(tail, 0, "]", 1)
+            out += rest
+            self._count(nodes + 2, depth)
+        return out
+
+    def value(self, said: str) -> Any:
+        """The value of a collection."""
+        value, nodes, depth = self._collection(said, 1, "]" if said[0] == "[" else "}", 1)
+        self._count(nodes, depth)
+        return value
+
+    def _count(self, nodes: int, depth: int) -> None:
+        self.nodes += nodes
+        self.depth = max(self.depth, depth)
+        if self.nodes > self._limits.yaml_nodes:
+            raise _NotSimpleError
+
+    def _collection(self, said: str, at: int, end: str, depth: int) -> tuple[Any, int, int]:
+        """(value, nodes, depth) of the collection whose content begins here and which ends the text."""
+        value, after, nodes, deepest = self._content(said, at, end, depth)
+        if after != len(said):
+            raise _NotSimpleError
+        return value, nodes, deepest
+
+    def _content(self, said: str, at: int, end: str, depth: int) -> tuple[Any, int, int, int]:
+        """(value, where it ends, nodes, depth) of a collection whose content begins here; end: its bracket."""
+        if depth > self._limits.yaml_depth:
+            raise _NotSimpleError
+        out: Any = [] if end == "]" else {}
+        nodes, deepest = 1, depth
+        if said.startswith(end, at):
+            return out, at + 1, nodes, deepest
+        while True:
+            key = None
+            m = _FLOW.match(said, at)
+            if m and end == "}":
+                key = m["key"]
+                if key is None:
+                    raise _NotSimpleError
+                at = m.end() + 2
+                nodes += 1
+                if key[0] in "'\"":
+                    key = key[1:-1]
+                if key in out:
+                    raise _NotSimpleError
+                m = _FLOW.match(said, at)
+            if m is None or m["key"] is not None:
+                raise _NotSimpleError
+            kind, at = m.lastgroup, m.end()
+            if kind == "open":
+                value, at, more, below = self._inner(said, at, depth + 1)
+                nodes += more
+                deepest = max(deepest, below)
+            else:
+                nodes += 1
+                text = m[m.lastindex or 0]
+                if kind == "plain":
+                    try:
+                        value = scalar(text)
+                    except ValueError:
+                        raise _NotSimpleError from None
+                else:
+                    value = text.replace("''", "'") if kind == "single" else text
+            if key is None:
+                out.append(value)
+            else:
+                out[sys.intern(key)] = value
+            if said.startswith(end, at):
+                return out, at + 1, nodes, deepest
+            if not said.startswith(", ", at):
+                raise _NotSimpleError
+            at += 2
+
+    def _inner(self, said: str, at: int, depth: int) -> tuple[Any, int, int, int]:
+        """As ``_content``, for a collection inside another; a mapping that ends a row is known again."""
+        end = "]" if said[at - 1] == "[" else "}"
+        if end == "]" or depth != 2 or said[-2:] != "}]" or said.find("}", at) != len(said) - 2:
+            return self._content(said, at, end, depth)
+        rest = said[at:]
+        known = self._known.get(rest)
+        if known is None:
+            value, after, nodes, deepest = self._content(said, at, end, depth)
+            if after != len(said) - 1:
+                return value, after, nodes, deepest
+            known = self._known[rest] = (value, nodes, deepest)
+        return known[0], len(said) - 1, known[1], known[2]
+
+
 class _Lines(dict[str, _Line]):
     """Line -> what it says, understood when first asked for."""
 
+    def __init__(self, limits: Limits) -> None:
+        super().__init__()
+        self.flows = _Flows(limits)
+
     def __missing__(self, line: str) -> _Line:
+        row = _ROW.match(line)
+        if row:  # hardly any comes twice: not kept
+            first = len(row[1])
+            value: Any = self.flows.row(row[2], row[3], row[4])
+            return (-2, None, value, (first, True, first + 2, None))
+        if line[-1:] in ("]", "}"):
+            flow = _FLOW_LINE.match(line)
+            if flow:
+                first, key = len(flow["indent"]), flow["key"]
+                dashed = (flow["dash"] or flow["dashed"]) is not None
+                value = self.flows.value(flow["flow"])
+                where = -2 if key is None else -10 - first if dashed else first
+                return (where, key, value, (first, dashed, first + 2 * dashed, None))
+        return self._block(line)
+
+    def _block(self, line: str) -> _Line:
         usual = _USUAL.match(line)
         if usual:
             spaces, key, decimal, word = usual.groups()
@@ -437,7 +596,9 @@ def _load_lines(text: str, limits: Limits) -> Any:
     waiting = True  # the last key or dash has no value yet
     key: str | None = None
     anchor: str | None = None  # of what is waited for
-    for where, name, value, rest in map(_Lines().__getitem__, lines):
+    known = _Lines(limits)
+    flows = known.flows
+    for where, name, value, rest in map(known.__getitem__, lines):
         if where == at:
             if name in here:
                 raise _NotSimpleError
@@ -479,7 +640,7 @@ def _load_lines(text: str, limits: Limits) -> Any:
             here.append(new)
             stack.append((inner, new, False))
             here = new
-        if len(stack) - 1 > limits.yaml_depth or (name is not None and name in here):
+        if len(stack) - 1 + flows.depth > limits.yaml_depth or (name is not None and name in here):
             raise _NotSimpleError
         key, anchor = name, its_anchor
         if anchor is not None and anchor in anchors:
@@ -503,6 +664,8 @@ def _load_lines(text: str, limits: Limits) -> Any:
         if anchor is not None:
             raise _NotSimpleError
         _put(here, key, None)
+    if 4 * len(lines) + flows.nodes > limits.yaml_nodes:
+        raise _NotSimpleError
     return root[0]
 
 

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from app.errors import BadUpload, TooLarge, UnreadableFile
 from app.formats import Limits, _yaml
+from app.formats._rmf import Flow
 
 LIMITS = Limits()
 
@@ -266,6 +267,68 @@ def test_both_ways_agree_on_whatever_the_quick_way_takes(rows: list[Any], end: s
     value = quick(said)
     if value is not NotImplemented:
         assert orjson.dumps(value) == orjson.dumps(_yaml._load_events(said, LIMITS)), said
+
+
+FLOWING = [
+    "[", "]", "{", "}", ", ", ", ", ": ", ",", ":", "a", "b c", "1", "-2.5", "08", "1e-05", "yes", "~", "''", "'it''s'",
+    "'a, b'", '"d: e"', '"e\\n"', "it's", "a:b", "k: ", "'k': ", "-", "- 1", "?", "#", " #c", "&n ", "*n", "!!str 1",
+    "<<: ", "é", " ", "{a: 1}", "[1, 2]", "[1, 2, {a: [4, true]}]", "{a: 1, b: [2, x]}", "[]", "{}", "%", "a\tb",
+]  # fmt: skip
+
+
+@settings(max_examples=1500, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["", "  "]),
+            st.sampled_from(["- ", "- ", "k: ", "m: ", "- k: ", "- [1, 2.5, ", "- [0, -0, "]),
+            st.lists(st.sampled_from(FLOWING), max_size=7),
+        ),
+        min_size=1,
+        max_size=4,
+    ),
+)
+@example([("", "- ", ["[1, 2, {a: [4, true]}]"])] * 2)
+@example([("", "- [1, 2.5, ", ["1", ", ", "yes", "]"]), ("", "- [1, 2.5, ", ["08", ", ", "''", "]"])])
+def test_both_ways_agree_on_collections_in_flow_style(rows: list[Any]) -> None:
+    said = "\n".join(indent + start + "".join(words) for indent, start, words in rows)
+    value = quick(said)
+    if value is not NotImplemented:
+        assert orjson.dumps(value) == orjson.dumps(_yaml._load_events(said, LIMITS)), said
+
+
+floats = st.floats(allow_nan=False, allow_infinity=False)
+flowing = st.recursive(
+    st.none() | st.booleans() | st.integers(-99, 99) | floats | st.text("a1b -'", max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text("ab ", min_size=1, max_size=3), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.lists(flowing, min_size=1, max_size=5), min_size=1, max_size=5))
+def test_rows_in_flow_style_are_taken_the_quick_way(rows: list[Any]) -> None:
+    said = "rows:\n" + "".join(f"  - {Flow()(row)}\n" for row in rows)
+    reference = _yaml._load_events(said, LIMITS)
+    assert orjson.dumps(reference) == orjson.dumps({"rows": rows}, option=orjson.OPT_SORT_KEYS)
+    value = quick(said)
+    assert value is not NotImplemented, said
+    assert orjson.dumps(value) == orjson.dumps(reference), said
+
+
+def test_limits_hold_for_collections_in_flow_style() -> None:
+    rows = b"- [1, 2, {a: [4, true], b: [1, '']}]\n" * 10  # 12 nodes a row
+    assert len(_yaml.load(rows, Limits(yaml_nodes=121))) == 10
+    with pytest.raises(TooLarge, match="nodes") as caught:
+        _yaml.load(rows, Limits(yaml_nodes=110))
+    assert caught.value.problems[0].line == 10
+    with pytest.raises(UnreadableFile, match="nested deeper"):
+        _yaml.load(b"a:\n" + rows, Limits(yaml_depth=4))
+    with pytest.raises(UnreadableFile, match="nested deeper"):
+        load("a: " + "[" * 60 + "]" * 60)
+    assert _yaml.load(b"a:\n" + rows, Limits(yaml_depth=5))["a"][9] == [1, 2, {"a": [4, True], "b": [1, ""]}]
 
 
 @settings(max_examples=500, deadline=None)
