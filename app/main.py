@@ -24,6 +24,7 @@ from starlette.exceptions import HTTPException
 
 from app import __version__
 from app.api import (
+    changes,
     channels,
     convert,
     derivations,
@@ -123,6 +124,7 @@ def create_app(settings: Settings) -> Server:
         layers,
         maps,
         diff,
+        changes,
         channels,
         transform,
         formats,

@@ -612,6 +612,21 @@ class DiffOut(BaseModel):
     layers: dict[str, Any]
 
 
+class DeltaOut(BaseModel):
+    """What turns one version into another."""
+
+    environment: str
+    since: dict[str, Any]
+    version: int
+    root: str
+    crs: Literal["local", "wgs84"]
+    datum: dict[str, Any]
+    levels: dict[str, Any]
+    layers: dict[str, Any]
+    grids: list[dict[str, Any]]
+    other: list[dict[str, str]]
+
+
 # --- parameters ---
 
 EnvironmentPath = Annotated[

@@ -48,7 +48,7 @@ def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
         f"{e}/versions": "get post", v: "get", f"{v}/sources": "get", f"{v}/sources/{{name}}": "get",
         f"{v}/layers": "get", f"{v}/layers/{{layer}}": "get", f"{e}/edits": "post", f"{v}/maps": "get",
         f"{v}/maps/{{format}}": "get", f"{v}/maps/{{format}}/{{file}}": "get", f"{v}/reports/{{format}}": "get",
-        f"{e}/diff": "get", f"{e}/channels": "get", f"{e}/channels/{{channel}}": "put",
+        f"{e}/diff": "get", f"{v}/delta": "get", f"{e}/channels": "get", f"{e}/channels/{{channel}}": "put",
         f"{e}/channels/{{channel}}/planned": "delete", f"{e}/transform": "get", "/api/v1/convert": "post",
         "/api/v1/derivations": "get", "/api/v1/events": "get", f"{v}/provenance": "get",
         "/api/v1/keys": "get post", f"{v}/manifest": "get", f"{e}/derivations": "post",

@@ -1,0 +1,150 @@
+"""What changed in meaning between two versions, for robots that patch their live maps."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import numpy as np
+import orjson
+from fastapi import APIRouter, Query, Request
+from numpy.typing import NDArray
+from starlette.responses import Response
+
+from app.api.access import Viewer
+from app.api.answers import Route, answer, json_bytes
+from app.api.caching import none_match
+from app.api.layers import Crs, feature_collection
+from app.api.maps import number_of
+from app.api.schemas import VERSION, DeltaOut, EnvironmentPath, VersionPath, told
+from app.api.services import Here, Services
+from app.errors import MissingDatum
+from app.model.features import Features
+from app.model.frame import Anchor
+from app.model.geodesy import local_frame
+from app.model.grid import OCCUPIED, OccupancyGrid
+from app.model.layers import VECTOR_LAYERS, PartKey
+from app.store.values import Delta, FeatureDelta, GridDelta, Rectangle, Version
+
+MAX_CELLS = 4 * 2**20
+"""Where more cells of a grid changed, fetching the grid is less work than reading them as JSON."""
+
+router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"], route_class=Route)
+
+
+@router.get(
+    "/delta",
+    responses={**told(DeltaOut, 404, 422), 304: {"description": "The client has it"}},
+    summary="What changed in meaning since a version",
+)
+def get_delta(
+    env: EnvironmentPath,
+    v: VersionPath,
+    request: Request,
+    here: Here,
+    _: Viewer,
+    since: Annotated[
+        str, Query(pattern=VERSION, description="What the client has: number, channel, or `latest`.", examples=["0"])
+    ],
+    crs: Crs = None,
+) -> Response:
+    """What turns the version `since` into `v`, which may also be the older one.
+
+    `layers`: for each vector layer the features to put (GeoJSON as `/layers/{layer}` has it; id, `level` and `part`
+    name one) and those to delete. Where the datum changed, places change that nobody edited: all features are put.
+    `grids`: rectangles of changed cells, each as a `map_msgs/OccupancyGridUpdate`: `x`, `y`, `width`, `height` in cells
+    of the grid, row 0 at the bottom, `data` row by row, 0…100 and -1 for unknown. `whole`: the grid's frame is another
+    one (or most of a large grid changed): fetch it. `other`: parts that have no delta: fetch what is made of them.
+    """
+    new, old = here.store.version(env, number_of(v)), here.store.version(env, number_of(since))
+    wanted: Anchor = crs or ("wgs84" if new.datum else "local")
+    seed = json_bytes(["delta", old.root, new.root, old.number, new.number, wanted, env])
+    headers = {
+        "etag": f'"{hashlib.sha256(seed).hexdigest()[:32]}"',
+        "fleetmap-version": str(new.number),
+        "fleetmap-root": new.root,
+    }
+    if none_match(request.headers.get("if-none-match"), headers["etag"]):
+        return Response(status_code=304, headers=headers)
+    delta = here.store.delta_parts(old, new)
+    body = {
+        "environment": env,
+        "since": {"version": old.number, "root": old.root},
+        "version": new.number,
+        "root": new.root,
+        "crs": wanted,
+        "datum": {"changed": delta.datum, "value": new.datum.as_dict() if new.datum else None},
+        "levels": {"changed": delta.levels, "value": [[level.name, level.elevation] for level in new.levels]},
+        "layers": _layers(here, new, delta, wanted),
+        "grids": [_grid(here, new, change) for change in delta.grids],
+        "other": [_named(key) for key in delta.other],
+    }
+    return answer(body, headers=headers)
+
+
+def _layers(here: Services, new: Version, delta: Delta, crs: Anchor) -> dict[str, Any]:
+    changes = list(delta.features)
+    if delta.datum:
+        changes = _everything(here, new, changes)
+    frame = local_frame(new.datum) if new.datum else None
+    puts: dict[str, list[tuple[PartKey, Features]]] = {}
+    deleted: dict[str, list[dict[str, str]]] = {}
+    for change in changes:
+        layer = change.key.layer
+        if frame is None and len(change.put) and bool((change.put.local != (crs == "local")).any()):
+            raise MissingDatum(
+                f"{new.environment} has no datum in version {new.number}, so local metres have no place on earth: ask "
+                "for the other crs, or give it a datum"
+            )
+        puts.setdefault(layer, []).append((change.key, change.put))
+        gone = [{"id": item, "level": change.key.level, "part": change.key.name} for item in change.deleted]
+        deleted.setdefault(layer, []).extend(gone)
+    return {
+        layer: {
+            "put": orjson.Fragment(feature_collection(parts, crs, frame, new, with_datum=False)),
+            "deleted": deleted[layer],
+        }
+        for layer, parts in sorted(puts.items())
+    }
+
+
+def _everything(here: Services, new: Version, changes: Sequence[FeatureDelta]) -> list[FeatureDelta]:
+    """All features are put, since in the frame that is answered in each may have moved."""
+    out = {change.key: change for change in changes}
+    for entry in new.parts:
+        if entry.key.layer in VECTOR_LAYERS:
+            known = out.get(entry.key)
+            gone = known.deleted if known is not None else ()
+            out[entry.key] = FeatureDelta(entry.key, here.store.features(new, entry.key), gone)
+    return [out[key] for key in sorted(out)]
+
+
+def _grid(here: Services, new: Version, change: GridDelta) -> dict[str, Any]:
+    out: dict[str, Any] = {"name": change.key.name, "level": change.key.level, "deleted": change.deleted}
+    whole = change.whole or sum(r.cells.size for r in change.rectangles) > MAX_CELLS
+    out |= {"whole": whole, "frame": None, "updates": []}
+    if change.deleted:
+        return out
+    part = here.store.load(new, [change.key]).parts[change.key]
+    assert isinstance(part, OccupancyGrid)
+    out["frame"] = {
+        "width": part.width,
+        "height": part.height,
+        "resolution": part.resolution,
+        "origin": list(part.origin),
+    }
+    if not whole:
+        out["updates"] = [_update(rectangle) for rectangle in change.rectangles]
+    return out
+
+
+def _update(rectangle: Rectangle) -> dict[str, Any]:
+    height, width = rectangle.cells.shape
+    cells: NDArray[np.int8] = np.where(rectangle.cells > OCCUPIED, -1, rectangle.cells).astype(np.int8).ravel()
+    data = orjson.Fragment(orjson.dumps(np.ascontiguousarray(cells), option=orjson.OPT_SERIALIZE_NUMPY))
+    return {"x": rectangle.column, "y": rectangle.row, "width": width, "height": height, "data": data}
+
+
+def _named(key: PartKey) -> dict[str, str]:
+    return {"layer": key.layer, "level": key.level, "name": key.name}
