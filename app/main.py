@@ -43,6 +43,7 @@ from app.api import (
     robots,
     tokens,
     transform,
+    vda5050,
     versions,
 )
 from app.api.access import Access
@@ -134,6 +135,7 @@ def create_app(settings: Settings) -> Server:
         manifest,
         provenance,
         robots,
+        vda5050,
         jobs,
         tokens,
     ):

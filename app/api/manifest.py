@@ -80,7 +80,7 @@ async def get_manifest(
     for name in names:
         seen: set[str] = set()
         for values in _variants(name, version):
-            outcome = await _made(here, version, name, values, request, who)
+            outcome = await made_for(here, version, name, values, request, who)
             if isinstance(outcome, Started):
                 return started(outcome.job)
             for file in outcome.files:
@@ -133,9 +133,10 @@ def _variants(name: str, version: Version) -> list[dict[str, str]]:
     return [{}]
 
 
-async def _made(
+async def made_for(
     here: Services, version: Version, name: str, values: dict[str, str], request: Request, who: Any
 ) -> Made | Started:
+    """A version's map in a format, with these options; the job where it takes long."""
     while True:
         recipe: Recipe = await run_in_threadpool(here.maps.recipe, version, name, values)
         made = await run_in_threadpool(here.maps.ready, recipe)

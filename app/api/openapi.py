@@ -115,6 +115,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("maps", "Maps in a format, converted on demand."),
             ("channels", "Which version robots drive on."),
             ("robots", "Who holds what, who lags."),
+            ("vda5050", "Maps for fleet managers that speak VDA 5050."),
             ("events", "Every change as it happens."),
             ("manifest", "What a robot verifies."),
             ("transform", "Between earth and local frame."),

@@ -612,6 +612,29 @@ class DiffOut(BaseModel):
     layers: dict[str, Any]
 
 
+class ActionsOut(BaseModel):
+    """Instant actions of VDA 5050 for one version."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    map_id: str = Field(alias="mapId")
+    map_version: str = Field(alias="mapVersion")
+    environment: str
+    version: int
+    root: str
+    size: int = Field(description="Bytes behind the link.")
+    download_map: dict[str, Any] = Field(alias="downloadMap")
+    enable_map: dict[str, Any] = Field(alias="enableMap")
+    delete_map: dict[str, Any] = Field(alias="deleteMap")
+
+
+class StateOut(BaseModel):
+    """What became of a vehicle's state."""
+
+    robots: list[RobotOut]
+    ignored: list[dict[str, str]]
+
+
 class DeltaOut(BaseModel):
     """What turns one version into another."""
 

@@ -1,0 +1,107 @@
+"""VDA 5050 (3.0, sections 6.3 and 6.4): instant actions that bring a map to a vehicle, and what its state says of maps.
+
+Only the messages' content: carrying it over MQTT, with its header, is the fleet manager's. An action's id tells what it
+is about (``downloadMap:<mapId>:<mapVersion>:<unique>``), so that a state that says it failed can be understood. A state
+says which map is enabled (the vehicle drives on it) or disabled (it has it); optional fields may be absent or null.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from app.errors import Invalid, Problem
+
+MAX_MAPS = 1000
+MAX_ACTIONS = 10_000
+
+Action = Literal["downloadMap", "enableMap", "deleteMap"]
+
+_ACTION_ID = re.compile(r"(downloadMap|enableMap):(.+):([0-9]{1,9}):[^:]*", re.DOTALL)
+
+
+def action(kind: Action, map_id: str, version: int, unique: str, **more: str) -> dict[str, Any]:
+    """One instant action. unique: what no other action has. more: further parameters.
+
+    Enabling another map takes a vehicle that stands still and does nothing else (blocking type HARD); fetching and
+    deleting goes on beside driving.
+    """
+    parameters = {"mapId": map_id, "mapVersion": str(version), **more}
+    return {
+        "actionType": kind,
+        "actionId": f"{kind}:{map_id}:{version}:{unique}",
+        "blockingType": "HARD" if kind == "enableMap" else "NONE",
+        "actionParameters": [{"key": key, "value": value} for key, value in parameters.items()],
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Maps:
+    """What a state says of one map: versions by what they are. failed: of actions of ours that failed, and why."""
+
+    map_id: str
+    enabled: tuple[str, ...]
+    disabled: tuple[str, ...]
+    failed: tuple[tuple[str, str], ...]
+
+
+def read_state(message: Any) -> tuple[Maps, ...]:
+    """The maps of a state message, by id; what it does not speak of is not there. Invalid says what is wrong with it.
+
+    A download that failed and whose map is there all the same was followed by one that did not fail.
+    """
+    if not isinstance(message, Mapping):
+        raise Invalid("a state message is a JSON object", [Problem("no object", where="body")])
+    enabled: dict[str, list[str]] = {}
+    disabled: dict[str, list[str]] = {}
+    failed: dict[str, list[tuple[str, str]]] = {}
+    for k, item in enumerate(_list(message, "maps", MAX_MAPS)):
+        where = f"maps[{k}]"
+        map_id, version = _text(item, "mapId", where), _text(item, "mapVersion", where)
+        status = item.get("mapStatus")
+        if status not in ("ENABLED", "DISABLED"):
+            raise _refused("must be ENABLED or DISABLED", f"{where}.mapStatus")
+        (enabled if status == "ENABLED" else disabled).setdefault(map_id, []).append(version)
+    for map_id, versions in enabled.items():
+        if len(set(versions)) > 1:
+            raise _refused(f"several versions of {map_id[:80]} are ENABLED: at most one may be", "maps")
+    for k, item in enumerate(_list(message, "actionStates", MAX_ACTIONS)):
+        ours = _ACTION_ID.fullmatch(str(item.get("actionId")))
+        if ours is None or item.get("actionStatus") != "FAILED":
+            continue
+        why = item.get("resultDescription")
+        if why is not None and not isinstance(why, str):
+            raise _refused("must be a text", f"actionStates[{k}].resultDescription")
+        map_id, version = ours[2], ours[3]
+        if ours[1] == "downloadMap" and version in (*enabled.get(map_id, ()), *disabled.get(map_id, ())):
+            continue
+        failed.setdefault(map_id, []).append((version, why or "the vehicle does not say why"))
+    names = sorted(enabled.keys() | disabled.keys() | failed.keys())
+    return tuple(
+        Maps(n, tuple(enabled.get(n, ())[:1]), tuple(disabled.get(n, ())), tuple(failed.get(n, ()))) for n in names
+    )
+
+
+def _list(message: Mapping[str, Any], name: str, most: int) -> Sequence[Mapping[str, Any]]:
+    found = message.get(name)
+    if found is None:
+        return ()
+    if not isinstance(found, list) or len(found) > most:
+        raise _refused(f"must be a list of at most {most}", name)
+    for k, item in enumerate(found):
+        if not isinstance(item, Mapping):
+            raise _refused("must be an object", f"{name}[{k}]")
+    return found
+
+
+def _text(item: Mapping[str, Any], name: str, where: str) -> str:
+    found = item.get(name)
+    if not isinstance(found, str) or not found or len(found) > 512:
+        raise _refused("must be a text", f"{where}.{name}")
+    return found
+
+
+def _refused(problem: str, where: str) -> Invalid:
+    return Invalid(f"this is no VDA 5050 state: {where} {problem}", [Problem(problem, where=where)])

@@ -1,0 +1,131 @@
+"""VDA 5050: instant actions of a version, and state messages as status."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from app.errors import Invalid
+from app.fleet.vda5050 import Maps, read_state
+from tests.api.conftest import Api
+
+REAL = sorted(Path(__file__).parents[2].parent.glob("shared/data/vda5050/*/*tate*"))
+
+
+def parameters(action: dict[str, Any]) -> dict[str, str]:
+    return {p["key"]: p["value"] for p in action["actionParameters"]}
+
+
+def maps(env: str, *versions: tuple[Any, str], **more: Any) -> dict[str, Any]:
+    listed = [{"mapId": env, "mapVersion": v, "mapStatus": s, "mapDescriptor": None} for v, s in versions]
+    return {"headerId": 1, "maps": listed, "actionStates": None, **more}
+
+
+def test_actions_name_the_very_bytes(api: Api, farm: str) -> None:
+    told = api.get(f"environments/{farm}/versions/latest/vda5050/actions?mapId=hall&grid=map&file_type=png").json()
+    assert (told["mapId"], told["mapVersion"], told["version"]) == ("hall", "3", 3)
+    actions = [told[k] for k in ("downloadMap", "enableMap", "deleteMap")]
+    assert [a["actionType"] for a in actions] == ["downloadMap", "enableMap", "deleteMap"]
+    assert [a["blockingType"] for a in actions] == ["NONE", "HARD", "NONE"]
+    assert all(parameters(a)["mapId"] == "hall" and parameters(a)["mapVersion"] == "3" for a in actions)
+    assert set(actions[0]) == {"actionType", "actionId", "blockingType", "actionParameters"}
+    given = parameters(actions[0])
+    link = urlsplit(given["mapDownloadLink"])
+    assert f"{link.scheme}://{link.netloc}" == api.url
+    bundle = api.get(f"{link.path}?{link.query}").content
+    assert (hashlib.sha256(bundle).hexdigest(), len(bundle)) == (given["mapHash"], told["size"])
+    assert sorted(zipfile.ZipFile(io.BytesIO(bundle)).namelist()) == ["map.png", "map.yaml"]
+    again = api.get(f"environments/{farm}/versions/3/vda5050/actions?format=geojson").json()
+    assert again["mapId"] == farm
+    assert again["downloadMap"]["actionId"] != told["downloadMap"]["actionId"]
+    url = f"environments/{farm}/versions/3/vda5050/actions"
+    api.problem("GET", f"{url}?format=nothing", 404)
+    api.problem("GET", f"{url}?nonsense=1", 422)
+    api.problem("GET", f"{url}?format=occupancy_grid&grid=other", 404)
+    api.problem("GET", f"environments/{farm}/versions/77/vda5050/actions", 404)
+
+
+def test_a_state_is_a_status(api: Api, farm: str) -> None:
+    api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
+    vehicle = api.token_for("robot", robot="agv-1")
+    url = "robots/agv-1/vda5050/state"
+
+    def say(body: dict[str, Any], query: str = "") -> Any:
+        return vehicle.post(url + query, body, 200).json()
+
+    (told,) = say(maps(farm, ("2", "ENABLED"), ("1", "DISABLED")))["robots"]
+    assert (told["channel"], told["version"], told["state"]) == ("production", 2, "active")
+    assert told["lag"]["differs"] is False
+    plan = {"version": 3, "rollout": {"ready": 1}}
+    planned = api("PUT", f"environments/{farm}/channels/production", 200, json=plan).json()
+    assert planned["robots"]["ready"] == 0
+    failing = [{"actionId": f"downloadMap:{farm}:3:ab", "actionStatus": "FAILED", "resultDescription": "disk full"}]
+    (told,) = say(maps(farm, ("2", "ENABLED"), actionStates=failing))["robots"]
+    assert (told["state"], told["version"], told["detail"]) == ("failed", 3, "disk full")
+    both = maps(farm, ("3", "DISABLED"), ("2", "ENABLED"))
+    for _ in range(3):
+        (told,) = say(both)["robots"]
+        assert (told["state"], told["version"], told["holds"]["version"]) == ("ready", 3, 2)
+    states = [(h["state"], h["version"]) for h in api.get("robots/agv-1").json()["history"]]
+    assert states == [("ready", 3), ("failed", 3), ("active", 2)]
+    other = maps("hall", ("2", "ENABLED"))
+    assert say(other, f"?environment={farm}&channel=latest")["robots"][0]["channel"] == "latest"
+
+
+def test_what_is_not_known_is_told(api: Api, farm: str, bare: str) -> None:
+    editor = api.token_for("editor", environments=farm)
+    body = maps(farm, ("99", "ENABLED"))
+    body["maps"] += maps("nowhere", ("1", "ENABLED"))["maps"] + maps(bare, ("0", "ENABLED"))["maps"]
+    told = editor.post("robots/agv-2/vda5050/state", body, 200).json()
+    assert told["robots"] == []
+    assert [i["mapId"] for i in told["ignored"]] == sorted([farm, "nowhere", bare])
+    told = editor.post("robots/agv-2/vda5050/state", maps(farm, ("a-b", "ENABLED")), 200).json()
+    assert "no version's number" in told["ignored"][0]["why"]
+    editor.problem("POST", f"robots/agv-2/vda5050/state?environment={farm}", 422, json=body)
+    api.token_for("robot", robot="agv-1").problem("POST", "robots/agv-2/vda5050/state", 403, json=body)
+    api.token_for("viewer").problem("POST", "robots/agv-2/vda5050/state", 403, json=body)
+    api.problem("POST", "robots/agv-2/vda5050/state", 422, json={"maps": 1})
+    assert api.post("robots/agv-2/vda5050/state", {"maps": None}, 200).json() == {"robots": [], "ignored": []}
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        [], {"maps": {}}, {"maps": [1]}, {"maps": [{}]}, {"maps": [{"mapId": "a", "mapVersion": 1}]},
+        {"maps": [{"mapId": "a", "mapVersion": "1", "mapStatus": None}]}, maps("a", ("1", "ENABLED"), ("2", "ENABLED")),
+        {"maps": [None] * 1001}, {"actionStates": "x"},
+        {"actionStates": [{"actionId": "enableMap:a:1:x", "actionStatus": "FAILED", "resultDescription": 3}]},
+    ],
+)  # fmt: skip
+def test_bad_states_are_refused(bad: Any) -> None:
+    with pytest.raises(Invalid):
+        read_state(bad)
+
+
+def test_a_state_with_nulls() -> None:
+    states = [
+        {"actionId": "a", "actionStatus": "FAILED"},
+        {"actionId": None, "actionStatus": None},
+        {"actionId": "enableMap:x:y:7:1", "actionStatus": "FAILED", "resultDescription": None},
+        {"actionId": "downloadMap:a:1:9", "actionStatus": "FAILED", "resultDescription": "a first try"},
+    ]
+    assert read_state({**maps("a", ("1", "DISABLED")), "actionStates": states}) == (
+        Maps("a", (), ("1",), ()),
+        Maps("x:y", (), (), (("7", "the vehicle does not say why"),)),
+    )
+
+
+@pytest.mark.skipif(not REAL, reason="the real samples are not here")
+@pytest.mark.parametrize("path", REAL, ids=lambda p: p.name)
+def test_real_states(path: Path) -> None:
+    message = json.loads(path.read_text())
+    assert read_state(message) == ()
+    message["maps"] = maps("a", ("1", "ENABLED"))["maps"]
+    assert read_state(message) == (Maps("a", ("1",), (), ()),)
