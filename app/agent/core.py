@@ -21,7 +21,7 @@ from app.agent.folder import Folder
 from app.agent.state import State, load, save
 from app.agent.trust import File, Manifest
 from app.agent.web import Busy, Stopped, Web
-from app.errors import FleetMapError, Invalid, NotFound, Untrusted
+from app.errors import FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.events import messages
 from app.events.messages import RobotState, RobotStatus
 
@@ -36,6 +36,9 @@ GATHER_SECONDS = 0.02
 
 REJOIN_SECONDS = 1.0
 """A fleet that finds its router again does not ask in the same moment: up to so long."""
+
+AGAIN_SECONDS = 30.0
+"""A robot without Zenoh repeats its status with the first sync after so long."""
 
 NO_ROOT = "0" * 64
 
@@ -88,6 +91,9 @@ class Agent:
         self._lock = threading.Lock()
         self._said: RobotStatus | None = None
         self._put: RobotStatus | None = None
+        self._put_at = 0.0
+        self._target: tuple[int, str] | None = None
+        self._activated: tuple[str | None, tuple[int, str] | None] | None = None
         self._told: set[str] = set()
         self._preloaded: tuple[int, str, tuple[File, ...]] | None = None
         self._rejoined = False
@@ -211,6 +217,7 @@ class Agent:
 
     def _sync_and_tell(self) -> bool:
         self._after = 0.0
+        self._target = None
         try:
             good = self._sync()
         except FleetMapError as error:
@@ -233,11 +240,16 @@ class Agent:
         manifest = self._manifest(channel)
         if manifest is not None:
             self._install(manifest)
+        self._target = None
         good = self._run_hooks()
         if good:
-            self._say("active")
-        if plans is not None:
-            self._preload(next((p for p in plans if p.get("channel") == channel), {}).get("planned"))
+            planned = next((p for p in plans or () if p.get("channel") == channel), {}).get("planned")
+            standing = (self._folder.standing, self._state.marks.get(channel))
+            if planned is None or self._activated != standing:
+                self._say("active")
+                self._activated = standing
+            if plans is not None:
+                self._preload(planned)
         with self._lock:
             mark = self._state.marks.get(channel, (0, ""))[0]
             self._events = {s: e for s, e in self._events.items() if s > mark}
@@ -302,7 +314,8 @@ class Agent:
         whole = name is not None and installed is not None and not self._folder.damaged(name, installed)
         if not (whole and installed and (installed.content, installed.root) == (manifest.content, manifest.root)):
             received, deltas, begun = self._web.received, self._web.deltas, time.monotonic()
-            self._say("downloading", manifest)
+            self._target = (manifest.version, manifest.root)
+            self._say("downloading")
             sources = self._fetch(manifest, installed)
             layers = self._layers(installed, manifest)
             self._keep(dataclasses.replace(self._state, layers=tuple(sorted({*self._state.layers, *layers}))))
@@ -377,15 +390,17 @@ class Agent:
                 self._folder.tidy()
             return
         if self._preloaded is not None and self._preloaded[0] == version:
-            self._say("ready", preloaded=self._preloaded)
+            self._target = self._preloaded[:2]
+            self._say("ready")
             return
         found = self._web.manifest(self.options.environment, str(version), self.options.formats)
         if found is None:
             return
         manifest, _ = self._believe(found[0], found[1], None, None)
-        self._preloaded = (manifest.version, manifest.root, manifest.files)
+        self._target = (manifest.version, manifest.root)
         self._fetch(manifest, self._folder.manifest(self._folder.standing))
-        self._say("ready", preloaded=self._preloaded)
+        self._preloaded = (manifest.version, manifest.root, manifest.files)
+        self._say("ready")
 
     # --- hooks ---
 
@@ -426,18 +441,14 @@ class Agent:
             self._state = state
             save(self._folder.state, state)
 
-    def _say(
-        self,
-        state: RobotState,
-        target: Manifest | None = None,
-        detail: str | None = None,
-        preloaded: tuple[int, str, tuple[File, ...]] | None = None,
-    ) -> None:
-        """Note the status and send it. version and root: of what stands, or what is being fetched or lies ready."""
-        manifest = target or self._folder.manifest(self._folder.standing)
+    def _say(self, state: RobotState, detail: str | None = None) -> None:
+        """Note the status and send it. version and root: of what it is about: what stands, unless another
+        is being fetched or lies ready.
+        """
+        manifest = self._folder.manifest(self._folder.standing)
         version, root = (manifest.version, manifest.root) if manifest else (0, NO_ROOT)
-        if preloaded is not None:
-            version, root = preloaded[:2]
+        if self._target is not None:
+            version, root = self._target
         channel = self._state.channel or self.options.channel or LATEST
         sequence = manifest.sequence if manifest else None
         now = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
@@ -455,22 +466,26 @@ class Agent:
         self._say("failed", detail=detail)
 
     def _send_status(self) -> None:
-        """Over Zenoh and over HTTP, once for each change; what could not be sent is sent with the next sync."""
+        """Over Zenoh and over HTTP, once for each change; what could not be sent is sent with the next sync.
+
+        A robot that is not on the bus says it again now and then: only so does the server know that it is there.
+        """
         status = self._said
-        if status is None or _same(status, self._put) or self._stopping.is_set():
+        if status is None or self._stopping.is_set():
             return
-        if self._ear is not None:
+        on_bus = self._ear is not None and self._ear.connected
+        stale = not on_bus and time.monotonic() - self._put_at > AGAIN_SECONDS
+        if _same(status, self._put) and not stale:
+            return
+        if on_bus and self._ear is not None:
             self._ear.put_status(status)
         try:
             self._web.put_status(self._robot, {"environment": self.options.environment, **status.as_dict()})
-            self._put = status
-        except Busy:
-            pass
+        except Unavailable:
+            return
         except FleetMapError as error:
-            if not isinstance(error, NotFound) and "no answer" in error.detail:
-                return  # that is told already
             self._tell_once("status", detail=f"the server does not take the robot's status: {error.detail}")
-            self._put = status
+        self._put, self._put_at = status, time.monotonic()
 
     def _tell_once(self, what: str, **members: Any) -> None:
         if what not in self._told:

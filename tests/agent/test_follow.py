@@ -203,5 +203,55 @@ def test_two_robots_hold_the_same_root(api: Api, place: str, robot: Start) -> No
     for one in robots:
         one.wait("active", version=6)
     assert len({json.dumps(one.standing["files"]) + one.standing["root"] for one in robots}) == 1
+    told = api.get(f"robots?environment={place}").json()
+    assert {r["robot"] for r in told} == {"robot-1", "robot-2"}
+    latest = api.get(f"environments/{place}/channels").json()[0]
+    assert latest["robots"]["holding"] == latest["robots"]["total"] == latest["robots"]["online"] == 2
+    assert latest["robots"]["since"]
     for one in robots:
         assert one.stop() == 0
+
+
+def test_a_rollout_in_two_stages_waits_for_the_robot(api: Api, place: str, robot: Start) -> None:
+    api("PUT", f"environments/{place}/channels/production", 200, json={"version": 1})
+    api.upload(place, {"n.tmap2.yaml": network(1)})
+    one = robot("--poll", "3600")
+    one.wait("active", version=1)
+    one.wait("connected")
+    body = {"version": 2, "rollout": {"ready": 1.0, "failed": 0.5}}
+    api("PUT", f"environments/{place}/channels/production", 200, json=body)
+    one.wait("ready", version=2)
+    one.wait("active", version=2)
+    assert one.standing["version"] == 2
+    assert one.stop() == 0
+
+
+def test_a_robot_that_fails_takes_the_fleet_back(api: Api, place: str, robot: Start) -> None:
+    api("PUT", f"environments/{place}/channels/production", 200, json={"version": 1})
+    api.upload(place, {"n.tmap2.yaml": network(1)})
+    one = robot("--poll", "3600", "--on-change", "test $FLEETMAP_VERSION = 1")
+    one.wait("active", version=1)
+    one.wait("connected")
+    count = len(one.lines)
+    body = {"version": 2, "rollout": {"ready": 1.0, "failed": 0.5}}
+    api("PUT", f"environments/{place}/channels/production", 200, json=body)
+    one.wait("failed", after=count)
+    one.wait("active", after=count, version=1)
+    assert one.standing["version"] == 1
+    assert one.standing["sequence"] > 4
+    assert one.stop() == 0
+
+
+def test_a_robots_token_is_enough(api: Api, place: str, robot: Start) -> None:
+    made = api.post("tokens", {"name": "r", "role": "robot", "robot": "robot", "environments": place}).json()
+    one = robot("--once", "--on-change", "true", FLEETMAP_TOKEN=made["token"])
+    assert one.end() == 0, one.lines
+    assert one.saw("status") is None
+    assert api.get(f"robots/robot?environment={place}").json()["state"] == "active"
+    api.upload(place, {"n.tmap2.yaml": network(1)})
+    again = robot("--once", "--on-change", "true", FLEETMAP_TOKEN=made["token"])
+    assert again.end() == 0
+    assert again.saw("layers") is None
+    wrong = robot("--once", name="wrong", FLEETMAP_TOKEN="nonsense")
+    assert wrong.end() == 1
+    assert "FLEETMAP_TOKEN" in str(wrong.saw("failed"))
