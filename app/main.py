@@ -38,6 +38,7 @@ from app.api import (
     manifest,
     maps,
     openapi,
+    overlays,
     problems,
     provenance,
     robots,
@@ -135,6 +136,7 @@ def create_app(settings: Settings) -> Server:
         manifest,
         provenance,
         robots,
+        overlays,
         vda5050,
         jobs,
         tokens,
@@ -323,7 +325,7 @@ def _first_token(store: Store, settings: Settings) -> None:
 
 
 async def _tick(here: Services) -> None:
-    """Planned moves and roll-outs of channels, signs of life of jobs, and the daily clean-up."""
+    """Planned moves and roll-outs of channels, ends of overlays, signs of life of jobs, and the daily clean-up."""
     beat = 0.0
     collect = datetime.now(UTC) + COLLECT_EVERY
     while True:
@@ -333,6 +335,7 @@ async def _tick(here: Services) -> None:
             here.hot.count()
             await run_in_threadpool(here.store.apply_due, datetime.now(UTC))
             await run_in_threadpool(here.store.advance_rollouts, datetime.now(UTC), decide)
+            await run_in_threadpool(overlays.end_overlays, here, datetime.now(UTC))
             if beat >= BEAT_SECONDS:
                 beat = 0.0
                 await run_in_threadpool(here.work.beat)

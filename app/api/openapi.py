@@ -34,7 +34,7 @@ Versions are named by number, by channel (`production`), or `latest`. Coordinate
 and `latitude, longitude` in query parameters, as their names say.
 
 Access: `Authorization: Bearer <token>`. Roles: `viewer` and `robot` read, `robot` also tells
-the status of the robot that its token names; `editor` also uploads, edits, converts, moves
+the status of the robot that its token names and what is blocked; `editor` also uploads, edits, converts, moves
 channels and sets datums; `admin` does all.
 """
 
@@ -115,6 +115,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("maps", "Maps in a format, converted on demand."),
             ("channels", "Which version robots drive on."),
             ("robots", "Who holds what, who lags."),
+            ("overlays", "What robots report as blocked."),
             ("vda5050", "Maps for fleet managers that speak VDA 5050."),
             ("events", "Every change as it happens."),
             ("manifest", "What a robot verifies."),

@@ -272,6 +272,41 @@ class StatusBody(In):
     sequence: int | None = Field(None, ge=0, lt=2**63, description="Of the last event that it has processed.")
 
 
+class OverlayBody(In):
+    """What is blocked: a polygon or an edge."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={
+            "examples": [
+                {
+                    "kind": "blocked",
+                    "polygon": {
+                        "type": "Polygon",
+                        "coordinates": [
+                            [[-0.5245, 53.2687], [-0.5244, 53.2687], [-0.5244, 53.2688], [-0.5245, 53.2687]]
+                        ],
+                    },
+                    "crs": "wgs84",
+                    "ttl_seconds": 1800,
+                    "detail": "a fallen tree",
+                }
+            ]
+        },
+    )
+
+    kind: Literal["blocked"]
+    polygon: dict[str, Any] | None = Field(None, description="GeoJSON Polygon or MultiPolygon.")
+    edge: str | None = Field(None, min_length=1, max_length=512, description="An edge's id.")
+    crs: Literal["local", "wgs84"] | None = Field(
+        None, description="What the polygon is in; default: wgs84 where there is a datum."
+    )
+    level: str | None = Field(None, min_length=1, max_length=256, description="Of the polygon; default: `ground`.")
+    ttl_seconds: float = Field(3600.0, ge=1, le=2_592_000, description="How long it will be blocked, from now on.")
+    detail: str | None = Field(None, max_length=2000)
+
+
 class TokenBody(In):
     """A new token."""
 
@@ -612,6 +647,26 @@ class DiffOut(BaseModel):
     layers: dict[str, Any]
 
 
+class OverlayOut(BaseModel):
+    """What was reported as blocked, and what became of it."""
+
+    id: str
+    environment: str
+    kind: Literal["blocked"]
+    state: Literal["pending", "accepted", "rejected", "expired", "ended"]
+    level: str
+    reporter: str
+    created: datetime
+    expires: datetime
+    polygon: dict[str, Any] | None = None
+    edge: str | None = None
+    crs: Literal["local", "wgs84"] | None = None
+    detail: str | None = None
+    decided_by: str | None = None
+    decided: datetime | None = None
+    version: int | None = Field(None, description="That an accepted one went into.")
+
+
 class ActionsOut(BaseModel):
     """Instant actions of VDA 5050 for one version."""
 
@@ -672,6 +727,7 @@ FormatPath = Annotated[
     str, Path(max_length=64, description="A format's id; see `GET /api/v1/formats`.", examples=["geojson"])
 ]
 JobPath = Annotated[str, Path(max_length=100, description="A job's id.")]
+OverlayPath = Annotated[str, Path(max_length=100, description="An overlay's id.")]
 TokenPath = Annotated[str, Path(max_length=100, description="A token's id.")]
 LayerPath = Annotated[
     Literal["location", "objects", "topology", "occupancy", "voxels", "imagery", "zones"],

@@ -21,6 +21,7 @@ from app.store.generation import Generation
 from app.store.index import SpatialIndex
 from app.store.jobs import Jobs
 from app.store.outbox import Outbox
+from app.store.overlays import Overlays
 from app.store.robots import Robots
 from app.store.tokens import Tokens
 from app.store.versions import Versions
@@ -29,7 +30,9 @@ ABANDONED_SECONDS = 24 * 3600.0
 """A pack of this age that no row knows is no living upload's: the row comes right after it."""
 
 
-class Store(Environments, Versions, Content, SpatialIndex, Channels, Outbox, Tokens, Jobs, Robots, Collection):
+class Store(
+    Environments, Versions, Content, SpatialIndex, Channels, Outbox, Tokens, Jobs, Robots, Overlays, Collection
+):
     """One database and one blob folder. Thread-safe; cheap to open again in a worker process.
 
     database_url: ``sqlite:///PATH`` or ``postgresql+psycopg://…`` (with PostGIS). readonly: nothing can be written,

@@ -21,6 +21,7 @@ from app.store.tree import Draft
 IDEMPOTENCY_DAYS: Final = 7
 EVENT_DAYS: Final = 30
 JOB_DAYS: Final = 7
+OVERLAY_DAYS: Final = 30
 ROBOT_DAYS: Final = 90
 """After so long in silence a robot is no longer part of the fleet."""
 PAGE: Final = 500
@@ -33,7 +34,8 @@ class Collection(Base):
         """Remove chunks and blobs that no version refers to and that were not written or used within ``grace``.
 
         ``{chunks, blobs, bytes, temporary}``: how many went, bytes of the blobs. Old idempotency keys (7 days),
-        finished jobs (7 days), robots that are silent (90 days) and events of purged environments (30 days) go too.
+        finished jobs (7 days), robots that are silent (90 days), overlays that are
+        settled and events of purged environments (30 days) go too.
         ``grace`` must be longer than any upload takes. Damaged where a version's chunk is: nothing is removed then. One
         process at a time should collect.
         """
@@ -88,6 +90,9 @@ class Collection(Base):
             silent = now - timedelta(days=ROBOT_DAYS)
             for table in (tables.robot, tables.robot_history, tables.presence):
                 connection.execute(delete(table).where(table.c.time < silent))
+            decided = tables.overlay.c.state.in_(("rejected", "expired", "ended"))
+            old = tables.overlay.c.decided < now - timedelta(days=OVERLAY_DAYS)
+            connection.execute(delete(tables.overlay).where(decided, old))
             finished = jobs.c.state.in_(("done", "failed", "cancelled"))
             connection.execute(delete(jobs).where(finished, jobs.c.updated < now - timedelta(days=JOB_DAYS)))
             connection.execute(

@@ -359,6 +359,29 @@ robot_history = Table(
 )
 """What robots said, each time that it was something new; the newest of each robot are kept."""
 
+overlay = Table(
+    "overlay",
+    metadata,
+    Column("id", String(32), primary_key=True),
+    _environment(nullable=False),
+    Column("kind", String(16), nullable=False),
+    Column("state", String(16), nullable=False),
+    Column("level", String(256), nullable=False),
+    Column("polygon", JSON(none_as_null=True), nullable=True),
+    Column("edge", String(512), nullable=True),
+    Column("crs", String(8), nullable=True),
+    Column("detail", Text, nullable=True),
+    Column("reporter", Text, nullable=False),
+    Column("created", Moment, nullable=False),
+    Column("expires", Moment, nullable=False),
+    Column("decided_by", Text, nullable=True),
+    Column("decided", Moment, nullable=True),
+    Column("version", Integer, nullable=True),
+    Index("ix_overlay_environment", "environment_id", "state"),
+    Index("ix_overlay_expires", "state", "expires"),
+)
+"""What is reported as blocked. expires: end of the blocking. version: that an accepted one went into."""
+
 presence = Table(
     "presence",
     metadata,

@@ -436,6 +436,34 @@ class Move:
     time: datetime
 
 
+OverlayState = Literal["pending", "accepted", "rejected", "expired", "ended"]
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """Something that is blocked until ``expires``: a GeoJSON polygon in ``crs``, or an edge by its id.
+
+    state: ``pending`` until an editor accepts (into ``version``) or rejects it or its time is over (``expired``);
+    an accepted one is ``ended`` when it was taken out again.
+    """
+
+    environment: str
+    kind: str
+    level: str
+    polygon: Mapping[str, Any] | None
+    edge: str | None
+    crs: str | None
+    detail: str | None
+    reporter: str
+    created: datetime
+    expires: datetime
+    id: str = ""
+    state: OverlayState = "pending"
+    decided_by: str | None = None
+    decided: datetime | None = None
+    version: int | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class FeatureDelta:
     """What turns a vector part of one version into that of another: a moved feature is one put."""

@@ -48,7 +48,8 @@ def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
         f"{e}/versions": "get post", v: "get", f"{v}/sources": "get", f"{v}/sources/{{name}}": "get",
         f"{v}/layers": "get", f"{v}/layers/{{layer}}": "get", f"{e}/edits": "post", f"{v}/maps": "get",
         f"{v}/maps/{{format}}": "get", f"{v}/maps/{{format}}/{{file}}": "get", f"{v}/reports/{{format}}": "get",
-        f"{e}/diff": "get", f"{v}/delta": "get",
+        f"{e}/diff": "get", f"{v}/delta": "get", f"{e}/overlays": "get post",
+        f"{e}/overlays/{{id}}/accept": "post", f"{e}/overlays/{{id}}/reject": "post",
         f"{v}/vda5050/actions": "get", "/api/v1/robots/{robot}/vda5050/state": "post",
         f"{e}/channels": "get", f"{e}/channels/{{channel}}": "put",
         f"{e}/channels/{{channel}}/planned": "delete", f"{e}/transform": "get", "/api/v1/convert": "post",
@@ -170,6 +171,10 @@ def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -
         if path == "/api/v1/environments/{env}/channels/{channel}/planned":
             body = {"version": 1, "activate_at": "2099-01-01T00:00:00Z"}
             api("PUT", "environments/farm/channels/production", 200, json=body)
+        if "/overlays/{id}/" in path:
+            ring = [[0, 0], [1, 0], [1, 1], [0, 0]]
+            blocked = {"kind": "blocked", "crs": "local", "polygon": {"type": "Polygon", "coordinates": [ring]}}
+            known[path] = api("POST", "environments/farm/overlays", None, json=blocked).json()["id"]
         if path == "/api/v1/environments/{env}/derivations":
             api.upload("farm", {"lane.geojson": LANE})
         if _name((path, method, op)) == "purge_environment":

@@ -1,0 +1,146 @@
+"""Overlays: robots report what is blocked, editors decide on it."""
+
+from __future__ import annotations
+
+import logging
+from datetime import UTC, datetime, timedelta
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query
+from starlette.responses import Response
+
+from app.api.access import Editor, Reporter, Viewer
+from app.api.answers import Route, answer
+from app.api.schemas import EnvironmentPath, OverlayBody, OverlayOut, OverlayPath, told
+from app.api.services import Here, Services
+from app.errors import Conflict, FleetMapError, Invalid, Problem
+from app.fleet import overlays
+from app.ingest.edits import edit_changes
+from app.model.frame import GROUND
+from app.store.values import Overlay, rfc3339
+
+log = logging.getLogger(__name__)
+
+router = APIRouter(prefix="/environments/{env}/overlays", tags=["overlays"], route_class=Route)
+
+
+def as_dict(overlay: Overlay) -> dict[str, Any]:
+    """The overlay as clients see it, without its empty members."""
+    out: dict[str, Any] = {"id": overlay.id, "environment": overlay.environment, "kind": overlay.kind}
+    out |= {"state": overlay.state, "level": overlay.level, "reporter": overlay.reporter}
+    out |= {"created": rfc3339(overlay.created), "expires": rfc3339(overlay.expires)}
+    more: dict[str, Any] = {
+        "polygon": overlay.polygon,
+        "edge": overlay.edge,
+        "crs": overlay.crs,
+        "detail": overlay.detail,
+        "decided_by": overlay.decided_by,
+        "decided": rfc3339(overlay.decided) if overlay.decided else None,
+        "version": overlay.version,
+    }
+    return out | {name: value for name, value in more.items() if value is not None}
+
+
+@router.get("", responses=told(list[OverlayOut], 404), summary="What is reported as blocked")
+def list_overlays(
+    env: EnvironmentPath,
+    here: Here,
+    _: Viewer,
+    state: Annotated[
+        Literal["pending", "accepted", "rejected", "expired", "ended"] | None,
+        Query(description="Only these; left out: all of the last 30 days."),
+    ] = None,
+) -> Response:
+    """Oldest first. `pending` waits for a decision, `expired` was never decided on, `ended` was taken out again."""
+    return answer([as_dict(overlay) for overlay in here.store.overlays(env, state)])
+
+
+@router.post(
+    "",
+    status_code=201,
+    responses={
+        **told(OverlayOut, 400, 404, 409, 415, ok=201, description="It waits for a decision"),
+        200: {"model": OverlayOut, "description": "The same was reported before: its end has moved."},
+    },
+    summary="Report what is blocked",
+)
+def report_overlay(env: EnvironmentPath, body: OverlayBody, here: Here, who: Reporter) -> Response:
+    """A robot (or an editor) says that a polygon or an edge cannot be passed for a time. No map changes by that."""
+    if (body.polygon is None) == (body.edge is None):
+        raise Invalid("give polygon or edge, one of them", [Problem("one of polygon and edge", where="body")])
+    head = here.store.version(env)
+    now = datetime.now(UTC)
+    crs = None if body.polygon is None else body.crs or ("wgs84" if head.datum else "local")
+    level = body.level or GROUND
+    if body.edge is not None:
+        level = overlays.edge_of(here.store, head, body.edge)[0].level
+    wanted = Overlay(
+        environment=env,
+        kind=body.kind,
+        level=level,
+        polygon=body.polygon,
+        edge=body.edge,
+        crs=crs,
+        detail=body.detail,
+        reporter=who.robot or who.name,
+        created=now,
+        expires=now + timedelta(seconds=body.ttl_seconds),
+    )
+    edit_changes(here.store, head, overlays.accepting(here.store, head, wanted))  # Invalid now, not for the editor
+    overlay, new = here.store.add_overlay(wanted)
+    return answer(as_dict(overlay), 201 if new else 200)
+
+
+@router.post(
+    "/{id}/accept", responses=told(OverlayOut, 404, 409, 412, 422, 503), summary="Take an overlay into a version"
+)
+def accept_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
+    """A polygon becomes a zone of kind `keepout` with `expires`, an edge gets `blocked` and `blocked_until`: a version.
+    When its time is over it is taken out again, by a version as well.
+    """
+    now = datetime.now(UTC)
+    known = here.store.overlay(env, id)
+    if known.state == "pending" and known.expires <= now:
+        raise Conflict(f"the overlay {id} has expired")
+    if not (known.state == "accepted" and known.version is None):  # else a crash came between this and the version
+        known = here.store.decide_overlay(env, id, "pending", "accepted", who.name, now)
+    try:
+        version = _edit(here, known, ending=False, author=who.name)
+    except FleetMapError:
+        here.store.decide_overlay(env, id, "accepted", "pending", who.name, now)
+        raise
+    return answer(as_dict(here.store.note_overlay_version(env, id, version)))
+
+
+@router.post("/{id}/reject", responses=told(OverlayOut, 404, 409), summary="Reject an overlay")
+def reject_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
+    """It stays in the list, and nothing changes."""
+    return answer(as_dict(here.store.decide_overlay(env, id, "pending", "rejected", who.name, datetime.now(UTC))))
+
+
+def _edit(here: Services, overlay: Overlay, *, ending: bool, author: str) -> int:
+    """The version that an overlay is in, or is out of; the same one where this is done twice."""
+    head = here.store.version(overlay.environment)
+    changes = (overlays.ending if ending else overlays.accepting)(here.store, head, overlay)
+    if not changes:
+        return head.number
+    what = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
+    message = f"{what} is free again" if ending else f"{what} is blocked until {rfc3339(overlay.expires)}"
+    outcome = here.ingest.edit(
+        overlay.environment, changes, message=f"{message} (reported by {overlay.reporter})", author=author
+    )
+    return outcome.version.number if outcome.version else head.number
+
+
+def end_overlays(here: Services, now: datetime) -> None:
+    """What is blocked no longer: pending overlays expire, accepted ones are taken out of the map. Blocks."""
+    for overlay in here.store.expire_overlays(now):
+        try:
+            _edit(here, overlay, ending=True, author=overlay.decided_by or "")
+            here.store.decide_overlay(
+                overlay.environment, overlay.id, "accepted", "ended", overlay.decided_by or "", now
+            )
+        except Conflict:
+            continue  # another process was quicker
+        except FleetMapError as error:
+            log.warning("the overlay %s of %s cannot be ended: %s", overlay.id, overlay.environment, error.detail)

@@ -1,0 +1,137 @@
+"""What robots report as blocked, and what editors make of it."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+
+from app.errors import Unavailable
+from tests.api.conftest import Api
+
+SQUARE = {"type": "Polygon", "coordinates": [[[1, 1], [4, 1], [4, 3], [1, 3], [1, 1]]]}
+
+
+def edge(api: Api, env: str, name: str, version: str = "latest") -> dict[str, Any]:
+    features = api.get(f"environments/{env}/versions/{version}/layers/topology?crs=local").json()["features"]
+    found: dict[str, Any] = next(f for f in features if f["id"] == name)
+    return found
+
+
+def zones(api: Api, env: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = api.get(f"environments/{env}/versions/latest/layers/zones?crs=local").json()[
+        "features"
+    ]
+    return found
+
+
+def until(condition: Any) -> Any:
+    deadline = time.monotonic() + 20
+    while not (found := condition()):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    return found
+
+
+def test_a_blocked_polygon_becomes_a_keepout_and_goes_again(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/overlays"
+    robot = api.token_for("robot", robot="mower-7", environments=farm)
+    said = {"kind": "blocked", "polygon": SQUARE, "crs": "local", "ttl_seconds": 4, "detail": "a trailer"}
+    told = robot.post(url, said).json()
+    assert {k: told[k] for k in ("state", "reporter", "detail", "polygon", "crs", "level")} == {
+        "state": "pending", "reporter": "mower-7", "detail": "a trailer", "polygon": SQUARE, "crs": "local",
+        "level": "ground",
+    }  # fmt: skip
+    assert robot.post(url, said, 200).json()["id"] == told["id"]
+    assert api.get(f"environments/{farm}").json()["version"] == 3, "no map changes by a report"
+    robot.problem("POST", f"{url}/{told['id']}/accept", 403)
+    robot.problem("POST", f"{url}/{told['id']}/reject", 403)
+    accepted = api.post(f"{url}/{told['id']}/accept", expect=200).json()
+    assert (accepted["state"], accepted["version"], accepted["decided_by"]) == ("accepted", 4, "administrator")
+    (zone,) = zones(api, farm)
+    assert zone["properties"] == {
+        "kind": "keepout", "expires": accepted["expires"],
+        "overlay": {"id": told["id"], "reporter": "mower-7", "detail": "a trailer"},
+    }  # fmt: skip
+    assert "reported by mower-7" in api.get(f"environments/{farm}/versions/4").json()["message"]
+    mask = api.get(f"environments/{farm}/versions/4/maps/occupancy_grid/keepout.pgm").content
+    assert mask.startswith(b"P5")
+    api.problem("POST", f"{url}/{told['id']}/accept", 409)
+    until(lambda: api.get(f"{url}?state=ended").json())
+    assert zones(api, farm) == []
+    assert api.get(f"environments/{farm}").json()["version"] == 5
+    assert api.get(f"{url}?state=pending").json() == []
+
+
+def test_a_blocked_edge(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/overlays"
+    before = edge(api, farm, "gate_barn")
+    told = api.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": 3}).json()
+    accepted = api.post(f"{url}/{told['id']}/accept", expect=200).json()
+    now = edge(api, farm, "gate_barn")
+    assert now["properties"] == {**before["properties"], "blocked": True, "blocked_until": accepted["expires"]}
+    assert now["place"] == before["place"]
+    until(lambda: api.get(f"{url}?state=ended").json())
+    assert edge(api, farm, "gate_barn") == before
+    roots = [api.get(f"environments/{farm}/versions/{v}").json()["root"] for v in (3, 5)]
+    assert roots[0] == roots[1], "nothing of it stays"
+
+
+def test_undecided_overlays_expire(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/overlays"
+    told = api.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": 1}).json()
+    until(lambda: api.get(f"{url}?state=expired").json())
+    api.problem("POST", f"{url}/{told['id']}/accept", 409)
+    assert api.get(f"environments/{farm}").json()["version"] == 3
+    other = api.post(url, {"kind": "blocked", "edge": "gate_barn"}).json()
+    assert api.post(f"{url}/{other['id']}/reject", expect=200).json()["state"] == "rejected"
+    api.problem("POST", f"{url}/{other['id']}/accept", 409)
+    assert [o["state"] for o in api.get(url).json()] == ["expired", "rejected"]
+
+
+def test_a_zone_that_an_editor_removed_is_not_missed(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/overlays"
+    said = {"kind": "blocked", "polygon": SQUARE, "crs": "local", "ttl_seconds": 2}
+    told = api.post(url, said).json()
+    api.post(f"{url}/{told['id']}/accept", expect=200)
+    gone = {"op": "delete", "layer": "zones", "id": f"overlay-{told['id']}"}
+    api.post(f"environments/{farm}/edits", {"changes": [gone]})
+    until(lambda: api.get(f"{url}?state=ended").json())
+    assert api.get(f"environments/{farm}").json()["version"] == 5
+
+
+def test_refusals(api: Api, farm: str, bare: str) -> None:
+    url = f"environments/{farm}/overlays"
+    line = {"type": "LineString", "coordinates": [[0, 0], [1, 1]]}
+    for bad in (
+        {}, {"kind": "blocked"}, {"kind": "open", "edge": "gate_barn"}, {"kind": "blocked", "edge": "no_such"},
+        {"kind": "blocked", "edge": "gate"}, {"kind": "blocked", "edge": "gate_barn", "polygon": SQUARE},
+        {"kind": "blocked", "polygon": line}, {"kind": "blocked", "polygon": {"type": "Polygon"}},
+        {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": 0}, {"kind": "blocked", "edge": "gate_barn", "x": 1},
+    ):  # fmt: skip
+        api.problem("POST", url, 422, json=bad)
+    good = {"kind": "blocked", "edge": "gate_barn"}
+    api.token_for("viewer").problem("POST", url, 403, json=good)
+    api.token_for("robot", robot="r", environments=bare).problem("POST", url, 403, json=good)
+    api.problem("POST", f"{url}/none/accept", 404)
+    api.problem("GET", f"{url}?state=odd", 422)
+    api.problem("GET", "environments/nowhere/overlays", 404)
+    assert api.get(url).json() == []
+
+
+def test_what_cannot_be_accepted_waits_on(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    url = f"environments/{farm}/overlays"
+    told = api.post(url, {"kind": "blocked", "edge": "gate_barn"}).json()
+    here = api.app.state.services
+
+    def busy(*_: Any, **__: Any) -> Any:
+        raise Unavailable("busy")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(here.ingest), "edit", busy)
+        api.problem("POST", f"{url}/{told['id']}/accept", 503)
+    (now,) = api.get(url).json()
+    assert now["state"] == "pending"
+    assert "decided" not in now
+    assert api.post(f"{url}/{told['id']}/accept", expect=200).json()["version"] == 4
