@@ -31,8 +31,8 @@ class Robots(Base):
     def note_reports(self, heard: Sequence[Heard]) -> list[FleetMapError | None]:
         """Take in what robots say, in the order given, in one transaction: for each None, or why it was refused.
 
-        The same said again only renews the time. NotFound where there is no such environment, Conflict where it has
-        too many robots already.
+        The same said again, or the same report come by another way, only renews the time. NotFound where there is no
+        such environment, Conflict where it has too many robots already.
         """
         out: list[FleetMapError | None] = [None] * len(heard)
         with self._database.write(tell=False) as connection:
@@ -132,6 +132,9 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
     }
     values: dict[str, Any] = {**said, "said": report.said, "time": heard.time}
     again = known is not None and all(getattr(known, name) == value for name, value in said.items())
+    if known is not None and not again and _told_before(connection, environment_id, heard, said):
+        connection.execute(update(table).where(*own).values(time=heard.time))
+        return None
     if not again:
         values["since"] = heard.time
     if report.state == "active":
@@ -152,6 +155,20 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
     if not again:
         _remember(connection, environment_id, heard, said)
     return None
+
+
+def _told_before(connection: Connection, environment_id: str, heard: Heard, said: dict[str, Any]) -> bool:
+    """Whether this very report came before, by another way: robots tell over Zenoh and HTTP, and one may be late."""
+    table = tables.robot_history
+    if heard.report.said is None:
+        return False
+    query = select(table.c.id).where(
+        table.c.environment_id == environment_id,
+        table.c.robot == heard.robot,
+        table.c.said == heard.report.said,
+        *(table.c[name].is_not_distinct_from(value) for name, value in said.items()),
+    )
+    return connection.execute(query.limit(1)).scalar_one_or_none() is not None
 
 
 def _remember(connection: Connection, environment_id: str, heard: Heard, said: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -56,6 +57,20 @@ def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
         for m, state in ((3, "active"), (2, "failed"), (1, "downloading"), (0, "active"))
     ]
     assert len(farm.robot_history("farm", "r1", limit=2)) == 2
+
+
+def test_a_report_that_comes_twice_counts_once(farm: Store):
+    first = heard("r1", 0, B, "downloading", said=NOW)
+    second = heard("r1", 0, B, "ready", said=NOW + timedelta(seconds=1), detail="x")
+    farm.note_reports([first, second, replace(first, time=NOW + timedelta(minutes=1)), second])
+    assert [r.state for _, r in farm.robot_history("farm", "r1")] == ["ready", "downloading"]
+    (robot,) = farm.robots("farm")
+    assert (robot.report.state, robot.time) == ("ready", NOW)
+    farm.note_reports([replace(first, time=NOW + timedelta(minutes=1))])
+    (robot,) = farm.robots("farm")
+    assert (robot.report.state, robot.time) == ("ready", NOW + timedelta(minutes=1))
+    farm.note_reports([heard("r1", 2, B, "downloading", said=NOW + timedelta(seconds=2))])
+    assert farm.robots("farm")[0].report.state == "downloading"
 
 
 def test_robots_of_several_environments(farm: Store):
@@ -182,8 +197,6 @@ def test_lag_counts_the_events_not_acted_on(sqlite_store: Store):
     farm.create_environment("farm", datum=DATUM)
     channel = next(c for c in farm.channels("farm"))
     moves = [Move(n, n, str(n) * 64, NOW + timedelta(minutes=n)) for n in (2, 5, 7)]
-    from dataclasses import replace
-
     channel = replace(channel, root=moves[-1].root)
 
     def lag(*reports: Heard) -> Any:
