@@ -25,12 +25,13 @@ that was moved by an edit gets vertices where it stands.
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import groupby, islice, pairwise
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -43,7 +44,7 @@ from app.formats import Files, Format, Needs, ReadContext, WriteContext, _openrm
 from app.formats._network import own
 from app.formats._rmf import BUILDING, NAV_GRAPH, Array, Flow, index, listing, mapping, number, refuse, value_of
 from app.formats._text import DEGREES, METRES, numbers
-from app.model.features import Features, Properties, features, from_columns, points, segments, unique_ids
+from app.model.features import Features, Properties, alike, features, from_columns, points, segments, unique_ids
 from app.model.frame import GROUND, Level
 from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
 
@@ -260,6 +261,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     reader = _Reader(system, context, levels, reference)
     parts: dict[PartKey, Part] = {}
     lifts = reader.lifts(mapping(top.get("lifts"), "lifts"))
+    del top, said  # each level lets go of what has been read of it
     for level in levels.values():
         network = reader.topology(level, taken)
         objects = reader.objects(level, lifts.get(level.name, []))
@@ -278,8 +280,8 @@ def read(files: Files, context: ReadContext) -> Layers:
 
 def _level(name: str, order: int, said: Any) -> _Level:
     where = f"levels.{name}"
-    one = mapping(said, where)
-    rows = listing(one.get("vertices"), f"{where}.vertices")
+    one = dict(mapping(said, where))
+    rows = listing(one.pop("vertices", None), f"{where}.vertices")
     raw = _rmf.places(rows, f"{where}.vertices")
     elevation = number(one.get("elevation", 0.0) or 0.0, f"{where}.elevation")
     return _Level(name, order, one, raw, rows, elevation)
@@ -349,12 +351,16 @@ class _Reader:
 
     def topology(self, level: _Level, taken: set[str]) -> Features:
         """The vertices as nodes, the lanes as directed edges."""
+        sources, targets, lanes = self._lanes(level)
         properties: list[Properties] = []
         heights = np.zeros(len(level.rows))
         names = Counter[str]()
+        named, nameless, place = alike("kind", "name", NAME), alike("kind", NAME), alike("index")
         for k, row in enumerate(level.rows):
-            said: dict[str, Any] = {"kind": "node"}
-            rest: dict[str, Any] = {"index": k}
+            said = (named if len(row) > 3 and row[3] != "" else nameless).copy()
+            said["kind"] = "node"
+            rest = place.copy()
+            rest["index"] = k
             if len(row) > 3 and row[3] != "":
                 said["name"] = _text(row[3])
                 names[said["name"]] += 1
@@ -378,27 +384,38 @@ class _Reader:
         high = heights != 0
         if high.any():
             geometry[high] = points(np.column_stack([level.at[high], heights[high] + level.elevation]))
-        sources, targets, lanes = self._lanes(level)
-        ids = [_rmf.short(f"{level.ids[i]}_{level.ids[j]}", 490) for i, j in zip(sources, targets, strict=True)]
-        ids = unique_ids(ids, taken)
-        taken.update(ids)
-        for i, j, (lane, limit) in zip(sources, targets, lanes, strict=True):
-            said = {"kind": "edge", "source": level.ids[i], "target": level.ids[j], NAME: lane}
-            if limit:
-                said["speed_limit"] = limit
-            properties.append(said)
+        level.rows = []
+        made = (_rmf.short(f"{level.ids[i]}_{level.ids[j]}", 490) for i, j in zip(sources, targets, strict=True))
+        ids = [*level.ids, *unique_ids(made, taken)]
+        taken.update(islice(ids, len(level.ids), None))
+        properties += lanes
         lines = segments(level.at[sources], level.at[targets]) if sources else np.empty(0, object)
         both = np.concatenate([geometry, lines])
-        return from_columns([*level.ids, *ids], both, properties, "wgs84" if self.degrees else "local")
+        del lanes, sources, targets, geometry, lines
+        return from_columns(ids, both, properties, "wgs84" if self.degrees else "local")
 
-    def _lanes(self, level: _Level) -> tuple[list[int], list[int], list[tuple[dict[str, Any], float]]]:
-        """(sources, targets, what only we know of each edge and its speed limit), two-way lanes as two."""
+    def _lanes(self, level: _Level) -> tuple[list[int], list[int], list[Properties]]:
+        """(sources, targets, properties) of the edges, two-way lanes as two."""
         sources: list[int] = []
         targets: list[int] = []
-        out = []
+        out: list[Properties] = []
+        unlimited = alike("kind", "source", "target", NAME)
+        limited = alike("kind", "source", "target", NAME, "speed_limit")
+        there, back = alike("index", "parameters"), alike("index", "parameters", "reverse")
+
+        def edge(i: int, j: int, rest: dict[str, Any], limit: float) -> None:
+            sources.append(i)
+            targets.append(j)
+            said = (limited if limit else unlimited).copy()
+            said["kind"], said["source"], said["target"], said[NAME] = "edge", level.ids[i], level.ids[j], rest
+            if limit:
+                said["speed_limit"] = limit
+            out.append(said)
+
         graphless = loops = 0
         for k, i, j, parameters, more in self._between(level, "lanes"):
-            rest: dict[str, Any] = {"index": k, "parameters": parameters}
+            rest = there.copy()
+            rest["index"], rest["parameters"] = k, parameters
             if more:
                 rest["more"] = more
             said = value_of(parameters, "speed_limit", 0.0)
@@ -407,13 +424,11 @@ class _Reader:
                 limit = float(said)
             graphless += value_of(parameters, "graph_idx") is None
             loops += i == j
-            sources.append(i)
-            targets.append(j)
-            out.append((rest, limit))
+            edge(i, j, rest, limit)
             if value_of(parameters, "bidirectional") is True:
-                sources.append(j)
-                targets.append(i)
-                out.append(({**rest, "reverse": True}, limit))
+                reverse = {**rest, "reverse": True} if more else back.copy()
+                reverse["index"], reverse["parameters"], reverse["reverse"] = k, parameters, True
+                edge(j, i, reverse, limit)
         where = f"levels.{level.name}.lanes"
         if loops:
             self.context.warn(f"{loops} lanes lead from a vertex to itself", where=where)
@@ -423,9 +438,11 @@ class _Reader:
         return sources, targets, out
 
     def _between(self, level: _Level, section: str) -> Iterable[tuple[int, int, int, dict[str, Any], list[Any]]]:
-        """(place in the list, start, end, parameters, more) of the rows whose vertices exist."""
-        n = len(level.rows)
-        for k, row in enumerate(listing(level.said.get(section), f"levels.{level.name}.{section}")):
+        """(place in the list, start, end, parameters, more) of the rows whose vertices exist. Each row is let go."""
+        n = len(level.raw)
+        rows = list(listing(level.said.pop(section, None), f"levels.{level.name}.{section}"))
+        for k in range(len(rows)):
+            row, rows[k] = rows[k], None
             i, j, parameters, more = _edge(row, level.where(section, k))
             if 0 <= i < n and 0 <= j < n:
                 yield k, i, j, parameters, more
@@ -438,9 +455,11 @@ class _Reader:
         """Everything but vertices and lanes."""
         rows: list[tuple[str, Any, Properties]] = []
         prefix = _rmf.short(level.name, 200)
+        place = alike("index", "parameters", "vertices")
         for section, kind in LINES.items():
             for k, i, j, parameters, more in self._between(level, section):
-                rest: dict[str, Any] = {"index": k, "parameters": parameters, "vertices": [i, j]}
+                rest = place.copy()
+                rest["index"], rest["parameters"], rest["vertices"] = k, parameters, [i, j]
                 if more:
                     rest["more"] = more
                 said: dict[str, Any] = {"kind": kind, NAME: rest}
@@ -449,12 +468,12 @@ class _Reader:
                     said["name"] = name
                 rows.append((f"{prefix}/{kind}/{k}", shapely.LineString(level.at[[i, j]]), said))
         for section, kind in RINGS.items():
-            for k, one in enumerate(listing(level.said.get(section), f"levels.{level.name}.{section}")):
+            for k, one in enumerate(listing(level.said.pop(section, None), f"levels.{level.name}.{section}")):
                 where = level.where(section, k)
                 said = dict(mapping(one, where))
                 corners = listing(said.pop("vertices", None), f"{where}.vertices")
                 ring = [index(v, f"{where}.vertices[{m}]") for m, v in enumerate(corners)]
-                good = [v for v in ring if 0 <= v < len(level.rows)]
+                good = [v for v in ring if 0 <= v < len(level.raw)]
                 if len(good) < len(ring):
                     level.dangling.setdefault(section, []).append(one)
                     self.context.warn("has vertices that do not exist: kept in the level's document", where=where)
@@ -688,32 +707,40 @@ def _storeys(layers: Layers) -> list[_Storey]:
 
 
 Sections = dict[str, list[str]]
+"""By name: a level's lists as they are written, in pieces of whole lines."""
+
+
+def _lines_of(rows: Iterable[str]) -> list[str]:
+    """Rows as lines of a section, thousands together: far fewer texts are held than there are rows."""
+    left = iter(rows)
+    pieces = iter(lambda: "".join(f"      - {row}\n" for row in islice(left, 4096)), "")
+    return list(pieces)
 
 
 class _Vertices:
     """The vertex list of a level being written: nodes first, then whatever corners the objects need."""
 
-    def __init__(self, texts: list[tuple[str, str]], rows: list[str], old: Mapping[int, int]) -> None:
+    def __init__(self, rows: list[str], old: Mapping[int, int]) -> None:
         self.rows = rows
         self._old = old
-        self._texts = texts
-        self._by_place: dict[tuple[str, str], int] = {}
-        for k, place in enumerate(texts):
-            self._by_place.setdefault(place, k)
+        self._by_place: dict[str, int] = {}
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def at(self, place: tuple[str, str], hint: Any) -> int:
         """The vertex at this place (x and y as texts): the one it stood on, else any, else a new one."""
+        start = f"[{place[0]}, {place[1]}, "
         known = self._old.get(hint) if isinstance(hint, int) else None
-        if known is not None and self._texts[known] == place:
+        if known is not None and self.rows[known].startswith(start):
             return known
-        found = self._by_place.get(place)
+        if not self._by_place:  # most maps need it nowhere
+            for k, row in enumerate(self.rows):
+                self._by_place.setdefault(", ".join(row.split(", ", 2)[:2]) + ", ", k)
+        found = self._by_place.get(start)
         if found is None:
-            found = self._by_place[place] = len(self.rows)
-            self._texts.append(place)
-            self.rows.append(f"[{place[0]}, {place[1]}, 0.0, '']")
+            found = self._by_place[start] = len(self.rows)
+            self.rows.append(f"{start}0.0, '']")
         return found
 
 
@@ -754,17 +781,22 @@ class _Writer:
 
     def files(self) -> dict[str, bytes]:
         """``building.yaml``, then the images."""
-        levels = "".join(self._level(storey) for storey in self.storeys)
+        levels = [piece for storey in self.storeys for piece in self._level(storey)]
         lifts = self._lifts()
         if self.system == IMAGE:
             self._check()
         top = self._top()
         before = {key: value for key, value in top.items() if key < "levels"}
         after = {key: value for key, value in top.items() if key > "levels"}
-        text = [_yaml.mapping(before, 0) if before else "", "levels:\n", levels, lifts]
+        text = [_yaml.mapping(before, 0) if before else "", "levels:\n", *levels, lifts]
         text.append(_yaml.mapping(after, 0) if after else "")
         self._report()
-        return {FILE: "".join(text).encode(), **dict(sorted(self.used.items()))}
+        levels.clear()
+        text.reverse()
+        out = io.BytesIO()
+        while text:  # each piece is let go where it is written
+            out.write(text.pop().encode())
+        return {FILE: out.getvalue(), **dict(sorted(self.used.items()))}
 
     def _top(self) -> dict[str, Any]:
         top = {key: value for key, value in self.building.items() if key not in ("levels", "lifts")}
@@ -809,9 +841,10 @@ class _Writer:
 
     def _coordinates(self, part: Features, where: NDArray[np.intp], storey: str) -> tuple[Array, NDArray[np.intp]]:
         """The file's x and y of all coordinates of these items, and the item each belongs to."""
-        chosen = part.take(where)
-        frame = self.layers.frame
-        geometry = chosen.in_wgs84(frame) if self.degrees else chosen.in_local(frame)
+        geometry = part.geometry[where]
+        if (part.local[where] == self.degrees).any():
+            chosen, frame = part.take(where), self.layers.frame
+            geometry = chosen.in_wgs84(frame) if self.degrees else chosen.in_local(frame)
         at, owner = shapely.get_coordinates(geometry, return_index=True)
         return _to_file(self.system, at, self.transforms[storey]), owner
 
@@ -827,7 +860,8 @@ class _Writer:
         known = next((level.elevation for level in self.layers.levels if level.name == storey.name), None)
         return said if known is None or said == known else known
 
-    def _level(self, storey: _Storey) -> str:
+    def _level(self, storey: _Storey) -> list[str]:
+        """The level's lines, in pieces."""
         rest = dict(mapping(storey.document.get("level"), "level"))
         if self.converted:
             lost = sorted(key for key in rest if key in IN_PIXELS and rest[key])
@@ -836,18 +870,18 @@ class _Writer:
         rest["elevation"] = self._elevation(storey)
         self._drawings(rest, storey.name)
         vertices, ids = self._nodes(storey)
-        sections: Sections = {"lanes": self._lanes(storey, ids)}
+        sections: Sections = {"lanes": _lines_of(self._lanes(storey, ids))}
         self._objects(storey, vertices, sections)
         self._dangling(storey, vertices, sections)
-        sections["vertices"] = vertices.rows
+        sections["vertices"] = _lines_of(vertices.rows)
         out = [f"  {_yaml.text(storey.name)}:\n"]
         for key in sorted({*rest, *(k for k, rows in sections.items() if rows)}):
             if key in sections:
                 out.append(f"    {key}:\n")
-                out += [f"      - {row}\n" for row in sections[key]]
+                out += sections[key]
             else:
                 out.append(_yaml.mapping({key: rest[key]}, 4))
-        return "".join(out)
+        return out
 
     def _drawings(self, rest: dict[str, Any], level: str) -> None:
         """Take along the images that the level names, under names that stay below the building's folder."""
@@ -869,7 +903,7 @@ class _Writer:
     def _nodes(self, storey: _Storey) -> tuple[_Vertices, dict[str, int]]:
         """The nodes as vertices in their old order, and each id's place among them."""
         elevation = float(self._elevation(storey))
-        found: list[tuple[tuple[bool, int, int, str], str, tuple[str, str], str, int | None]] = []
+        found: list[tuple[tuple[bool, int, int, str], str]] = []
         for part in storey.networks:
             point = (shapely.get_type_id(part.geometry) == 0) & ~shapely.is_empty(part.geometry)
             node: NDArray[np.bool_] = np.array([p.get("kind") == "node" for p in part.properties], bool)
@@ -884,15 +918,15 @@ class _Writer:
                 key = (not known, at if isinstance(at, int) else 0, len(part.ids[k]), part.ids[k])
                 height = 0.0 if math.isnan(high) else high - elevation
                 row = self._vertex(part.ids[k], p, place, height)
-                found.append((key, part.ids[k], place, row, at if known else None))
-        found.sort(key=lambda row: row[0])
+                found.append((key, row))
+        found.sort(key=lambda item: item[0])
         ids: dict[str, int] = {}
         old: dict[int, int] = {}
-        for k, (_, i, _, _, was) in enumerate(found):
+        for k, ((unknown, was, _, i), _) in enumerate(found):
             ids.setdefault(i, k)
-            if was is not None:
+            if not unknown:
                 old.setdefault(was, k)
-        return _Vertices([row[2] for row in found], [row[3] for row in found], old), ids
+        return _Vertices([row for _, row in found], old), ids
 
     def _vertex(self, i: str, p: Properties, place: tuple[str, str], z: float) -> str:
         rest = own(p, NAME)
@@ -915,32 +949,30 @@ class _Writer:
 
     # lanes
 
-    def _lanes(self, storey: _Storey, ids: Mapping[str, int]) -> list[str]:
+    def _lanes(self, storey: _Storey, ids: Mapping[str, int]) -> Iterator[str]:
         """The edges as lanes: those of one lane, or opposite ones that say the same, as one two-way lane."""
-        lanes = [lane for part in storey.networks for lane in self._edges(part, ids)]
-        lanes.sort(key=lambda lane: lane.key)
-        waiting: dict[Any, list[_Lane]] = {}
-        out: list[_Lane] = []
-        for lane in lanes:
-            partner = waiting.get(lane.partner())
-            if partner and lane.source != lane.target:
-                first = partner.pop()
-                first.both = True
-                continue
-            waiting.setdefault(lane.says(), []).append(lane)
-            out.append(lane)
-        return [lane.row(self.flow) for lane in out]
+        for _, lanes in groupby(self._edges(storey, ids), key=lambda lane: lane.was):
+            waiting: dict[Any, list[_Lane]] = {}
+            out: list[_Lane] = []
+            for lane in lanes:
+                partner = waiting.get(lane.partner())
+                if partner and lane.source != lane.target:
+                    first = partner.pop()
+                    first.both = True
+                    continue
+                waiting.setdefault(lane.says(), []).append(lane)
+                out.append(lane)
+            for lane in out:
+                yield lane.row(self.flow)
 
-    def _edges(self, part: Features, ids: Mapping[str, int]) -> Iterable[_Lane]:
-        bends = shapely.get_num_coordinates(part.geometry)
-        for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
-            if p.get("kind") == "node":
-                continue
+    def _edges(self, storey: _Storey, ids: Mapping[str, int]) -> Iterator[_Lane]:
+        """The level's edges, in the order of the lanes that they were."""
+        for _, p, bends in _in_order(storey.networks):
             source, target = ids.get(str(p.get("source"))), ids.get(str(p.get("target")))
             if p.get("kind") != "edge" or source is None or target is None:
                 self.lost["edges without two nodes on their level"] += 1
                 continue
-            self.lost["edges' bends between their nodes"] += int(bends[k] > 2)
+            self.lost["edges' bends between their nodes"] += int(bends > 2)
             self.lost["edges' actions"] += p.get("action") is not None
             self.lost["edges' widths"] += p.get("width") is not None
             rest = own(p, NAME)
@@ -950,7 +982,7 @@ class _Writer:
                 self.lost["edges' attributes of other formats"] += any(
                     isinstance(v, dict) for key, v in p.items() if key != NAV_GRAPH
                 )
-            yield _Lane.of(i, p, rest, source, target)
+            yield _Lane.of(p, rest, source, target, self.flow)
 
     def _dangling(self, storey: _Storey, vertices: _Vertices, sections: Sections) -> None:
         """Rows to vertices that did not exist come back where they still do not."""
@@ -958,7 +990,7 @@ class _Writer:
             for row in rows:
                 ends = row["vertices"] if isinstance(row, dict) else row[:2]
                 if section in RINGS or not all(0 <= v < len(vertices) for v in ends):
-                    sections.setdefault(section, []).append(self.flow(row))
+                    sections.setdefault(section, []).extend(_lines_of([self.flow(row)]))
                     problem = f"{section} with vertices that do not exist: rmf_building_map_tools will refuse the file"
                     self.context.warn(problem, where=f"levels.{storey.name}.{section}")
                 else:
@@ -1006,7 +1038,7 @@ class _Writer:
                 else:
                     self.lost["objects that are no part of a building"] += 1
         for section, rows_of in found.items():
-            sections[section] = [row for _, row in sorted(rows_of, key=lambda item: item[0])]
+            sections[section] = _lines_of(row for _, row in sorted(rows_of, key=lambda item: item[0]))
         self.scaling[storey.name] = scaling
 
     def _line(self, p: Properties, vertices: _Vertices, ends: list[tuple[str, str]]) -> tuple[str, dict[str, Any]]:
@@ -1124,6 +1156,26 @@ def _place(i: str, p: Properties) -> tuple[bool, int, str]:
     return (not known, at if isinstance(at, int) else 0, i)
 
 
+def _in_order(parts: Sequence[Features]) -> Iterable[tuple[str, Properties, int]]:
+    """(id, properties, coordinates) of what is no node: by the lane it was and its direction, then the others by id."""
+
+    def each() -> Iterator[tuple[str, Properties, int]]:
+        for part in parts:
+            for i, p, bends in zip(part.ids, part.properties, shapely.get_num_coordinates(part.geometry), strict=True):
+                if p.get("kind") != "node":
+                    yield i, p, bends
+
+    def key(item: tuple[str, Properties, int]) -> tuple[bool, int, bool, int, str]:
+        i, p, _ = item
+        rest = own(p, NAME)
+        was = rest.get("index")
+        known = isinstance(was, int)
+        return (not known, was if isinstance(was, int) else 0, rest.get("reverse") is True, len(i), i)
+
+    # As they were read they are in order: then none is held.
+    return each() if all(a <= b for a, b in pairwise(map(key, each()))) else sorted(each(), key=key)
+
+
 def _lane_parameters(p: Properties) -> dict[str, Any]:
     """The parameters of a lane that comes from another format."""
     out = {key: list(value) for key, value in LANE_TEMPLATE.items()}
@@ -1143,32 +1195,31 @@ def _lane_parameters(p: Properties) -> dict[str, Any]:
 class _Lane:
     """A directed edge on its way to a lane. was: its lane's place in the file; reverse: it is that lane backwards."""
 
-    key: tuple[bool, int, bool, int, str]
     source: int
     target: int
     was: int | None
     reverse: bool
     limit: float
     parameters: dict[str, Any]
-    more: list[Any]
+    more: Sequence[Any]
     signature: str
     both: bool = False
 
     @classmethod
-    def of(cls, i: str, p: Properties, rest: Mapping[str, Any], source: int, target: int) -> _Lane:
-        """The edge with this id and properties; rest: what is known of its lane."""
+    def of(cls, p: Properties, rest: Mapping[str, Any], source: int, target: int, flow: Flow) -> _Lane:
+        """The edge with these properties; rest: what is known of its lane."""
         was = rest.get("index") if isinstance(rest.get("index"), int) else None
         reverse = rest.get("reverse") is True
-        parameters = dict(mapping(rest.get("parameters"), "parameters"))
+        parameters = mapping(rest.get("parameters"), "parameters")
         limit = _rmf.limit(p)
         said = value_of(parameters, "speed_limit", 0.0)
         if (said if isinstance(said, (int, float)) and said > 0 else 0.0) != limit:
-            parameters["speed_limit"] = [3, limit]
-        key = (was is None, was or 0, reverse, len(i), i)
-        known = {k: v for k, v in parameters.items() if k != "orientation"}
-        signature = str(was) if was is not None else Flow()(known)
-        more = rest.get("more") if isinstance(rest.get("more"), list) else []
-        return cls(key, source, target, was, reverse, limit, parameters, list(more or ()), signature)
+            parameters = {**parameters, "speed_limit": [3, limit]}
+        signature = str(was)
+        if was is None:
+            signature = flow({k: v for k, v in parameters.items() if k != "orientation"})
+        more = rest.get("more")
+        return cls(source, target, was, reverse, limit, parameters, more if isinstance(more, list) else (), signature)
 
     def _orientation(self) -> Any:
         return str(value_of(self.parameters, "orientation", ""))

@@ -219,6 +219,24 @@ def merge_documents(a: Properties, b: Properties) -> dict[str, Any]:
     return out
 
 
+def alike(*keys: str) -> dict[str, Any]:
+    """A mapping with these keys, all None, whose copies (``.copy()``, then set) share its table of keys.
+
+    Such a copy is a usual dict that takes little more than half the memory: for readers that make very many mappings
+    of the same keys (PEP 412; a copy that gets another key becomes one with a table of its own).
+    """
+
+    class Pattern:
+        pass
+
+    holder = Pattern()
+    for _ in range(64):  # the first instances keep room for keys to come
+        holder = Pattern()
+        for key in keys:
+            setattr(holder, key, None)
+    return vars(holder)
+
+
 def points(coordinates: NDArray[np.float64]) -> NDArray[np.object_]:
     """Point geometries from float64 [n, 2] or [n, 3]."""
     return np.asarray(shapely.points(coordinates), object).reshape(len(coordinates))
@@ -253,21 +271,29 @@ def _repeats(ids: Iterable[str]) -> Iterator[tuple[str, bool]]:
 
 def _check_coordinates(f: Features) -> None:
     """Finite everywhere; metres within MAX_METRES; latitude within ±90 and longitude within ±180 degrees."""
-    if not len(f.ids):
-        return
-    coordinates, owner = shapely.get_coordinates(f.geometry, include_z=True, return_index=True)
+    for first in range(0, len(f.ids), CHECKED):
+        some = slice(first, first + CHECKED)
+        _check_some(f.ids[some], f.geometry[some], f.local[some])
+
+
+CHECKED = 2**15
+"""Features that are checked at a time: the coordinates of all would take as much memory as the features do."""
+
+
+def _check_some(ids: Sequence[str], geometry: NDArray[np.object_], is_local: NDArray[np.bool_]) -> None:
+    coordinates, owner = shapely.get_coordinates(geometry, include_z=True, return_index=True)
     flat, z = coordinates[:, :2], coordinates[:, 2]
     # shapely gives NaN as the z of a 2-D geometry: only a 3-D one's z is looked at.
-    deep = shapely.has_z(f.geometry)[owner]
-    local = f.local[owner]
+    deep = shapely.has_z(geometry)[owner]
+    local = is_local[owner]
     bound = np.where(local[:, None], MAX_METRES, np.array([180.0, 90.0]))
     good = (np.abs(flat) <= bound).all(axis=1) & (~deep | (np.abs(z) <= MAX_METRES))
     if not good.all():
         k = int(owner[np.flatnonzero(~good)[0]])
         at = coordinates[np.flatnonzero(~good)[0]]
-        kind = "metres within ±1e7" if f.local[k] else "longitude within ±180 and latitude within ±90 degrees"
+        kind = "metres within ±1e7" if is_local[k] else "longitude within ±180 and latitude within ±90 degrees"
         place = ", ".join(f"{v:g}" for v in (at if deep[np.flatnonzero(~good)[0]] else at[:2]))
         raise Invalid(
-            f"feature {f.ids[k]!r} has the coordinates ({place}); they must be finite {kind}",
-            [Problem(f"coordinates ({place}) are not finite {kind}", where=f.ids[k])],
+            f"feature {ids[k]!r} has the coordinates ({place}); they must be finite {kind}",
+            [Problem(f"coordinates ({place}) are not finite {kind}", where=ids[k])],
         )

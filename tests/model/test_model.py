@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from app.model.features import (
     MAX_ID,
     NO_GEOMETRY,
     Features,
+    alike,
     concatenate,
     features,
     from_columns,
@@ -110,6 +112,26 @@ def test_the_bad_one_of_many_is_named() -> None:
     nested = shapely.GeometryCollection([shapely.MultiPoint([(0, 0), (0, 91)])])
     with pytest.raises(Invalid, match="'b'"):
         features([("a", line, {}), ("b", nested, {})], "wgs84")
+
+
+def test_the_bad_one_of_very_many_is_named() -> None:
+    at = np.zeros((70_000, 2))
+    at[66_000] = (2e7, 0)
+    with pytest.raises(Invalid, match="'i66000' has the coordinates"):
+        from_columns([f"i{k}" for k in range(len(at))], points(at), [{}] * len(at), "local")
+
+
+def test_copies_of_a_pattern_are_usual_mappings_that_take_less_memory() -> None:
+    pattern = alike("kind", "source", "target")
+    one, two = pattern.copy(), pattern.copy()
+    one["kind"], one["source"], one["target"] = "edge", "a", "b"
+    assert one == {"kind": "edge", "source": "a", "target": "b"}
+    assert list(one) == ["kind", "source", "target"]
+    assert two == {"kind": None, "source": None, "target": None}
+    assert sys.getsizeof(one) <= 0.7 * sys.getsizeof({"kind": "edge", "source": "a", "target": "b"})
+    two["more"] = 1
+    assert "more" not in one
+    assert "more" not in pattern.copy()
 
 
 def test_flat_and_high_geometries_may_be_mixed() -> None:
