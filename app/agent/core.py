@@ -32,7 +32,13 @@ FIRST_PAUSE_SECONDS = 1.0
 """After the first failure; doubled each time up to the pause between polls."""
 
 GATHER_SECONDS = 0.02
-"""Events that come together are one look at the server."""
+"""Events that come together are one look at the server. Doubled for each look that brought nothing, up to 5 seconds: on
+an open router anybody can put events.
+"""
+
+MAX_DOUBLINGS = 8
+KEPT_EVENTS = 200
+LAYER = re.compile(r"[a-z][a-z0-9_]{0,31}")
 
 REJOIN_SECONDS = 1.0
 """A fleet that finds its router again does not ask in the same moment: up to so long."""
@@ -97,6 +103,7 @@ class Agent:
         self._told: set[str] = set()
         self._preloaded: tuple[int, str, tuple[File, ...]] | None = None
         self._rejoined = False
+        self._in_vain = 0
 
     # --- outside ---
 
@@ -147,30 +154,41 @@ class Agent:
         if (installed := self._folder.manifest(self._folder.standing)) is not None:
             self._tell("holding", version=installed.version, root=installed.root)
         failures = 0
+        woken = False
         while not self._stopping.is_set():
             self._wake.clear()
+            before = (self._state.marks, self._said)
             pause = self.options.poll_seconds
             try:
                 self._find_router()
                 good = self._sync_and_tell()
                 failures = 0 if good else failures + 1
+                vain = woken and before == (self._state.marks, self._said)
+                self._in_vain = self._in_vain + 1 if vain else 0
             except Stopped:
                 break
             if failures:
                 pause = min(pause, FIRST_PAUSE_SECONDS * 2 ** min(20, failures - 1))
-            self._wait(max(self._after, pause * random.uniform(0.5, 1.5)))  # noqa: S311  jitter is no secret
+            woken = self._wait(max(self._after, pause * random.uniform(0.5, 1.5)))  # noqa: S311  jitter is no secret
 
     # --- what wakes it ---
 
-    def _wait(self, seconds: float) -> None:
-        if self._wake.wait(seconds) and not self._stopping.is_set():
+    def _wait(self, seconds: float) -> bool:
+        """Until something happens, at most so long: whether an event or the router was it."""
+        woken = self._wake.wait(seconds)
+        if woken and not self._stopping.is_set():
             rejoined, self._rejoined = self._rejoined, False
-            most = REJOIN_SECONDS * random.random() if rejoined else GATHER_SECONDS  # noqa: S311
+            most = REJOIN_SECONDS * random.random() if rejoined else self._gather  # noqa: S311
             self._stopping.wait(most)
+        return woken
+
+    @property
+    def _gather(self) -> float:
+        return GATHER_SECONDS * 2.0 ** min(MAX_DOUBLINGS, self._in_vain)
 
     def _heard(self, event: messages.Event) -> None:
         """In a thread of Zenoh's: remember it, wake the loop if it is of our concern."""
-        if event.environment != self.options.environment:
+        if event.environment != self.options.environment or not isinstance(event.channel, str | None):
             return
         channel = self._state.channel
         mark = self._state.marks.get(channel or "", (-1, ""))[0]
@@ -178,7 +196,7 @@ class Agent:
             return
         with self._lock:
             self._events[event.sequence] = event
-            while len(self._events) > 1000:
+            while len(self._events) > KEPT_EVENTS:
                 del self._events[min(self._events)]
         ours = {self.options.channel} if self.options.channel else {PRODUCTION, channel}
         if event.type == "version.created":
@@ -372,11 +390,14 @@ class Agent:
             previous = event.body.get("previous")
             if isinstance(previous, dict) and previous.get("root") == at and event.sequence <= new.sequence:
                 at = event.root
-                layers |= {str(part.get("layer")) for part in event.body.get("layers", ()) if isinstance(part, dict)}
-        if at == new.root:
+                parts = event.body.get("layers")
+                parts = parts if isinstance(parts, list) else []
+                layers |= {str(part.get("layer")) for part in parts if isinstance(part, dict)}
+        if at == new.root and all(LAYER.fullmatch(layer) for layer in layers):
             return sorted(layers)
         try:
-            return self._web.changed_layers(new.environment, old.version, new.version)
+            told = self._web.changed_layers(new.environment, old.version, new.version)
+            return [layer for layer in told if LAYER.fullmatch(layer)]
         except FleetMapError as error:
             self._tell("layers", detail=f"which layers changed is not known: {error.detail}")
             return []

@@ -10,13 +10,14 @@ import time
 from pathlib import Path
 
 import pytest
+import zenoh
 
 from app.events.bus import BusOptions, router_configuration
 from app.events.router import Router
 from tests.agent.conftest import ROOT, Gate, Robot, Start, network, whole
 from tests.api.conftest import ADMIN, Api, running, settings_for
 from tests.cli.conftest import ServerProcess
-from tests.events.conftest import eventually, free_port
+from tests.events.conftest import client_config, eventually, free_port
 
 
 def test_a_broken_download_is_gone_on_from(api: Api, place: str, robot: Start, gate: Gate) -> None:
@@ -88,6 +89,37 @@ def test_the_hook_runs_where_it_was_cut_off(api: Api, place: str, robot: Start, 
     assert (tmp_path / "again").exists()
     assert robot("--once", "--on-change", f"touch {tmp_path}/third").end() == 0
     assert not (tmp_path / "third").exists()
+
+
+def test_forged_events_cost_little_and_change_nothing(
+    api: Api, place: str, robot: Start, gate: Gate, port: int, tmp_path: Path
+) -> None:
+    one = robot("--poll", "3600", "--on-change", f"echo $FLEETMAP_LAYERS >> {tmp_path}/layers", server=gate.url)
+    one.wait("connected")
+    one.wait("active", version=1)
+    gate.requests.clear()
+    root = one.standing["root"]
+    session = zenoh.open(client_config(port))
+    try:
+        forged = {"type": "version.created", "environment": place, "version": 99, "root": "f" * 64, "layers": 7}
+        for number in range(400):
+            session.put(f"fleetmap/{place}/events", json.dumps({**forged, "sequence": 1000 + number}).encode())
+            session.put(f"fleetmap/{place}/events", b"[" * 1000)
+            more = {"channel": {"x": 1}, "previous": {"root": root}, "sequence": 2000 + number}
+            session.put(f"fleetmap/{place}/events", json.dumps({**forged, **more}).encode())
+            more = {"channel": None, "previous": {"root": root}, "sequence": 3}
+            session.put(f"fleetmap/{place}/events", json.dumps({**forged, **more}).encode())
+            time.sleep(0.01)
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+    asked = [path for _, path, _, _ in gate.requests if "/manifest" in path]
+    assert len(asked) < 30, len(asked)
+    assert one.standing["version"] == 1
+    api.upload(place, {"n.tmap2.yaml": network(1)})
+    one.wait("active", 15, version=2)
+    one.wait("hook", version=2)
+    assert (tmp_path / "layers").read_text().split() == ["topology"]
+    assert one.stop() == 0
 
 
 def test_sigterm_ends_it_in_the_middle_of_a_download(place: str, robot: Start, gate: Gate) -> None:
