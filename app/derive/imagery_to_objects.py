@@ -67,7 +67,7 @@ def imagery_to_objects(layers: Layers, parameters: Parameters, notes: Notes) -> 
 def _regions(found: Segments, on: Ground, parameters: Parameters) -> list[Row]:
     """Each region as a polygon, then the middle lines of paths and roads, in the local frame."""
     tolerance = on.resolution if parameters.outline_tolerance is None else parameters.outline_tolerance
-    shapes = _polygons(found.label, on.transform, tolerance)
+    shapes = polygons(found.label, on.transform, tolerance)
     rows: list[Row] = []
     for k, region in enumerate(found.regions, 1):
         if k in shapes:
@@ -77,7 +77,7 @@ def _regions(found: Segments, on: Ground, parameters: Parameters) -> list[Row]:
     return rows
 
 
-def _polygons(label: NDArray[np.int32], transform: Any, tolerance: float) -> dict[int, Any]:
+def polygons(label: NDArray[np.int32], transform: Any, tolerance: float) -> dict[int, Any]:
     """The area of each label, simplified, in metres."""
     from rasterio.features import shapes  # type: ignore[import-untyped]
     from rasterio.transform import Affine  # type: ignore[import-untyped]
@@ -143,6 +143,6 @@ def _plan(grid: OccupancyGrid, parameters: Parameters) -> list[Row]:
 
         connectivity = 4
         _, label = cv2.connectedComponents((grid.cells == value).astype(np.uint8), connectivity=connectivity)
-        for k, area in sorted(_polygons(label.astype(np.int32), (r, 0.0, x, 0.0, r, y), tolerance).items()):
+        for k, area in sorted(polygons(label.astype(np.int32), (r, 0.0, x, 0.0, r, y), tolerance).items()):
             rows.append((f"{kind}/{k}", area, {"kind": kind}))
     return rows

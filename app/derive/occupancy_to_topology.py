@@ -19,12 +19,11 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes, derives
-from app.derive.occupancy_to_voxels import MASKS
-from app.errors import Ambiguous, CannotConvert, Invalid, MissingLayer, NotFound, Problem, TooLarge
-from app.model import masks
+from app.derive._grids import called, chosen
+from app.errors import CannotConvert, Invalid, Problem, TooLarge
 from app.model.features import Features, Properties, from_columns, points
 from app.model.grid import OccupancyGrid
-from app.model.layers import MAP, NETWORK, Layers, Part, PartKey
+from app.model.layers import NETWORK, Layers, Part, PartKey
 from app.parameters import parameter
 
 if TYPE_CHECKING:
@@ -103,8 +102,8 @@ def occupancy_to_topology(layers: Layers, parameters: Parameters, notes: Notes) 
     """
     _check(parameters)
     parts: dict[PartKey, Part] = {}
-    for key, grid in _chosen(layers, parameters.grid).items():
-        parts[PartKey("topology", key.level, NETWORK)] = network(grid, parameters, notes, _called(key))
+    for key, grid in chosen(layers, parameters.grid, "ways").items():
+        parts[PartKey("topology", key.level, NETWORK)] = network(grid, parameters, notes, called(key))
     return Layers(parts, layers.datum, layers.levels)
 
 
@@ -155,33 +154,6 @@ def _check(parameters: Parameters) -> None:
     if wrong:
         problems = [Problem(f"belongs to method={BELONGS[n]}, not to {parameters.method}", where=n) for n in wrong]
         raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
-
-
-def _chosen(layers: Layers, name: str | None) -> dict[PartKey, OccupancyGrid]:
-    """One grid for each level: the named one, else ``map``, else the only one that is no costmap filter mask."""
-    grids = layers.grids()
-    if name is not None:
-        found = {k: g for k, g in grids.items() if k.name == name}
-        if not found:
-            there = ", ".join(sorted({k.name for k in grids})) or "none"
-            raise NotFound(f"there is no occupancy grid {name!r}; there are: {there}")
-        return found
-    out = {}
-    maps = {k: g for k, g in grids.items() if k.name not in MASKS and masks.NAME not in g.properties}
-    if not maps:
-        raise MissingLayer("costmap filter masks alone tell no ways: upload an occupancy grid of what stands there")
-    for level in dict.fromkeys(k.level for k in maps):
-        here = {k: g for k, g in maps.items() if k.level == level}
-        plain = {k: g for k, g in here.items() if k.name == MAP} or here
-        if len(plain) > 1:
-            there = ", ".join(k.name for k in plain)
-            raise Ambiguous(f"level {level!r} has several occupancy grids ({there}): name one with grid=")
-        out.update(plain)
-    return out
-
-
-def _called(key: PartKey) -> str:
-    return f"the occupancy grid {key.name!r} of level {key.level!r}"
 
 
 def _space(grid: OccupancyGrid, parameters: Parameters, called: str) -> Space:

@@ -59,6 +59,9 @@ OBJECTS = ("model", "include", "light")
 NO_WALLS = ("keepout", "speed", "nogo")
 """Grids that are masks: they are no walls unless one is asked for by its name."""
 
+OF_GRIDS = "occupancy"
+"""The family of objects that were made of a grid (``occupancy_to_objects``)."""
+
 SAME_POSE = 1e-6
 
 
@@ -421,11 +424,15 @@ def _read_list(library: _sdf.Library, main: str, context: ReadContext) -> Layers
 
 # --- writing -----------------------------------------------------------------------------------------------------
 def choose(keys: Sequence[PartKey], options: WriteOptions) -> list[PartKey]:
-    """All objects and their files, and one grid for walls: the named one, else ``map``, else the only one."""
+    """All objects and their files, and one grid for walls: the named one, else ``map``, else the only one.
+
+    Objects that were made of a level's grid stand for it, unless it is named.
+    """
     kept = [k for k in keys if k.layer in ("objects", "resources") and options.level in (None, k.level)]
     grids = [k for k in keys if k.layer == "occupancy"]
     if options.grid is None:
-        grids = [k for k in grids if k.name not in NO_WALLS]
+        told = {k.level for k in kept if (k.layer, k.name) == ("objects", OF_GRIDS)}
+        grids = [k for k in grids if k.name not in NO_WALLS and k.level not in told]
         names = {k.name for k in grids}
         if any(k.layer == "objects" for k in kept) and len(names) > 1 and "map" not in names:
             return kept

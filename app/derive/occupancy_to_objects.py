@@ -1,0 +1,215 @@
+"""Occupancy -> objects: a grid's obstacles as trees or posts, walls, and furniture, as far as their shapes tell.
+
+A piece of occupied cells that touch is
+
+========= =============================================================================================================
+a post    where it is round (or, among trees, of any shape and no larger than a trunk), its inside unknown or not: a
+          laser sees only the rim
+a wall    where it is a straight piece no thicker than ``wall_width``; of other pieces all that is no thicker, each
+          straight edge of its middle line within ``tolerance`` one wall
+furniture where it is a rectangle that is thicker, up to the size that the context allows
+obstacle  else, as an outline within ``tolerance``
+========= =============================================================================================================
+
+Pieces around free cells are never solid. Cells count as occupied from the grid's ``occupied_thresh`` on; unknown cells
+are no objects.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import Notes, derives
+from app.derive._figures import MOST, Box, Disc, Found, Sizes, figures
+from app.derive._grids import called, chosen
+from app.errors import CannotConvert, TooLarge
+from app.model.features import features
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import Layers, Part, PartKey
+from app.parameters import parameter
+
+NAME = "occupancy"
+"""The family under which these objects stand."""
+
+CELLS = 2**29
+"""Cells that are looked at."""
+
+Row = tuple[str, Any, dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What stands in such a place. Metres: heights, the widest post, the longest furniture, the largest trunk."""
+
+    post: str
+    furniture: str
+    heights: Mapping[str, float]
+    widest: float
+    longest: float
+    trunk: float = 0.0
+
+
+CONTEXTS: Mapping[str, Context] = {
+    "forest": Context("tree", "rock", {"tree": 15.0, "rock": 1.0, "wall": 1.5, "obstacle": 1.5}, 3.0, 3.0, 1.0),
+    "orchard": Context("tree", "crate", {"tree": 3.0, "crate": 1.0, "wall": 2.0, "obstacle": 2.0}, 4.0, 3.0, 0.6),
+    "office": Context("post", "furniture", {"post": 2.5, "furniture": 0.8, "wall": 2.5, "obstacle": 2.5}, 1.5, 4.0),
+    "warehouse": Context("post", "rack", {"post": 5.0, "rack": 3.0, "wall": 5.0, "obstacle": 5.0}, 1.5, 20.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """What the grid shows, and how exactly."""
+
+    context: Literal["forest", "orchard", "office", "warehouse"] = parameter(
+        "office",
+        "what stands there: what is round is a tree (forest, orchard) or a post, how high and large things are",
+    )
+    grid: str | None = parameter(None, "which grid; default: map, else the only one of a level that is no filter mask")
+    minimum_size: float | None = parameter(
+        None, "what is less than this across is a speck; default: two cells", minimum=0.0, maximum=100.0, unit="m"
+    )
+    height: float | None = parameter(
+        None, "how high all of it is; default: what the context says of each kind", minimum=1e-3, maximum=1e3, unit="m"
+    )
+    tolerance: float | None = parameter(
+        None,
+        "how far straight edges may be from the cells; default: one and a half cells",
+        minimum=0.0,
+        maximum=100.0,
+        unit="m",
+    )
+    wall_width: float = parameter(
+        0.4, "what is thicker is no wall; at least three cells", minimum=0.0, maximum=10.0, unit="m"
+    )
+
+
+@derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0)
+def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
+    """A grid's obstacles as objects: posts or trees, walls and furniture by their shapes, of the height of a context.
+
+    In local metres with ``pose`` and ``shapes`` (cylinders, boxes) but where the outline is irregular, which has a
+    ``height`` alone. Walls are their middle lines with a ``width``. Raises CannotConvert where nothing is occupied or
+    nothing else is, NotFound or Ambiguous where the grid is not clear.
+    """
+    parts: dict[PartKey, Part] = {}
+    used: set[str] = set()
+    for key, grid in chosen(layers, parameters.grid, "obstacles").items():
+        rows = _objects(grid, parameters, layers.elevation(key.level), notes, called(key))
+        used.update(row[2]["kind"] for row in rows)
+        parts[PartKey("objects", key.level, NAME)] = features(rows, "local")
+    for kind in sorted(used):
+        if parameters.height is None:
+            value = CONTEXTS[parameters.context].heights[kind]
+            notes.fill(f"height of {kind}", value, f"a grid tells none; usual in the context {parameters.context}")
+    if parameters.height is not None:
+        notes.fill("height", parameters.height, "a grid does not say how high what it shows is")
+    notes.warn(f"what the objects are is guessed from their shapes in the context {parameters.context}")
+    return Layers(parts, layers.datum, layers.levels)
+
+
+def _objects(grid: OccupancyGrid, parameters: Parameters, floor: float, notes: Notes, name: str) -> list[Row]:
+    context = CONTEXTS[parameters.context]
+    cell = grid.resolution
+    mask = _occupied(grid, name)
+    sizes = Sizes(
+        speck=2.0 if parameters.minimum_size is None else parameters.minimum_size / cell,
+        disc=context.widest / cell,
+        box=context.longest / cell,
+        wall=max(parameters.wall_width / cell, 3.0) + 1e-6,
+        small=context.trunk / cell,
+        tolerance=1.5 if parameters.tolerance is None else parameters.tolerance / cell,
+    )
+    least = sizes.speck * cell
+    try:
+        found = figures(mask, grid.cells == FREE, sizes)
+    except CannotConvert as error:
+        raise CannotConvert(f"{name}: {error.detail}") from error
+    notes.drop("specks", found.specks, f"{name}: less than minimum_size={least:g} m across")
+    count = len(found.discs) + len(found.boxes) + len(found.walls) + len(found.areas)
+    if not count:
+        raise CannotConvert(
+            f"{name} has nothing but {found.specks} specks less than {least:g} m across: give a smaller minimum_size"
+        )
+    if count > MOST:
+        raise CannotConvert(
+            f"{name} would be {count} objects, the limit is {MOST}: give a larger minimum_size than {least:g} m"
+        )
+    return _rows(found, grid, context, parameters.height, floor)
+
+
+def _occupied(grid: OccupancyGrid, name: str) -> NDArray[np.uint8]:
+    """1 where something stands; CannotConvert where that is nowhere, or everywhere that is known."""
+    if grid.cells.size > CELLS:
+        raise TooLarge(f"{name} has {grid.cells.size} cells; objects can be made of at most {CELLS}")
+    meaning = np.zeros(256, np.uint8)
+    meaning[: OCCUPIED + 1] = np.arange(OCCUPIED + 1) / 100 >= grid.occupied_thresh
+    meaning[FREE], meaning[OCCUPIED], meaning[UNKNOWN] = 0, 1, 0
+    mask = np.asarray(meaning[grid.cells])
+    if not mask.any():
+        counts = grid.counts()
+        told = ", ".join(f"{counts[n]} {n}" for n in ("free", "unknown", "other") if counts[n])
+        raise CannotConvert(f"{name} has no occupied cell ({told}), so it shows no objects: upload one with obstacles")
+    if mask.all():
+        raise CannotConvert(f"{name} is occupied all over: it shows no objects that stand somewhere")
+    return mask
+
+
+def _rows(found: Found, grid: OccupancyGrid, context: Context, height: float | None, floor: float) -> list[Row]:
+    """Posts, walls, furniture, obstacles, each numbered from 1, in the local frame."""
+    cell = grid.resolution
+    x, y, yaw = grid.origin
+    c, s = math.cos(yaw), math.sin(yaw)
+
+    def placed(at: NDArray[np.float64]) -> NDArray[np.float64]:
+        u, v = at[:, 0] * cell, at[:, 1] * cell
+        return np.asarray(np.round(np.stack([x + c * u - s * v, y + s * u + c * v], axis=1), 9) + 0.0, np.float64)
+
+    def high(kind: str) -> float:
+        return context.heights[kind] if height is None else height
+
+    def body(kind: str, figure: Disc | Box, size: list[float], solid: dict[str, Any]) -> dict[str, Any]:
+        (px, py), h = placed(np.array([[figure.x, figure.y]]))[0].tolist(), high(kind)
+        turned = figure.yaw + yaw if isinstance(figure, Box) else 0.0
+        pose = [px, py, floor, 0.0, 0.0, round(math.remainder(turned, math.tau), 9) + 0.0]
+        solid = {**solid, "pose": [0.0, 0.0, h / 2, 0.0, 0.0, 0.0]}
+        return {"kind": kind, "pose": pose, "size": [*size, h], "height": h, "shapes": [solid]}
+
+    rows: list[Row] = []
+    for k, disc in enumerate(found.discs, 1):
+        kind, radius = context.post, round(disc.radius * cell, 6)
+        turn = np.arange(24) * (math.tau / 24)
+        ring = np.stack([disc.x + disc.radius * np.cos(turn), disc.y + disc.radius * np.sin(turn)], axis=1)
+        said = body(kind, disc, [2 * radius] * 2, {"type": "cylinder", "radius": radius, "length": high(kind)})
+        rows.append((f"{kind}/{k}", shapely.Polygon(placed(ring)), {**said, "radius": radius}))
+    for kind, boxes in (("wall", found.walls), (context.furniture, found.boxes)):
+        for k, box in enumerate(boxes, 1):
+            size = [round(box.length * cell, 6), round(box.width * cell, 6)]
+            said = body(kind, box, size, {"type": "box", "size": [*size, high(kind)]})
+            along, across = _axes(box)
+            middle = np.array([box.x, box.y])
+            if kind == "wall":
+                half = along * max(box.length - box.width, 0.1 * box.length) / 2  # its ends are square, as RMF's are
+                geometry: Any = shapely.LineString(placed(np.array([middle - half, middle + half])))
+                said["width"] = size[1]
+            else:
+                a, b = along * box.length / 2, across * box.width / 2
+                corners = np.array([middle - a - b, middle + a - b, middle + a + b, middle - a + b])
+                geometry = shapely.Polygon(placed(corners))
+            rows.append((f"{kind}/{k}", geometry, said))
+    for k, area in enumerate(found.areas, 1):
+        outline = shapely.make_valid(shapely.transform(area, placed))
+        rows.append((f"obstacle/{k}", outline, {"kind": "obstacle", "height": high("obstacle")}))
+    return rows
+
+
+def _axes(box: Box) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    c, s = math.cos(box.yaw), math.sin(box.yaw)
+    return np.array([c, s]), np.array([-s, c])
