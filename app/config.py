@@ -11,7 +11,7 @@ import ipaddress
 import os
 from pathlib import Path
 from typing import Any, Literal, Self
-from urllib.parse import unquote, urlsplit
+from urllib.parse import parse_qs, unquote, urlsplit
 
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -135,6 +135,33 @@ class Settings(BaseSettings):
         default=64 * 2**20, ge=1024, description="Largest file that is answered over Zenoh; HTTP has no such bound."
     )
 
+    imagery_url: str | None = Field(
+        default=None,
+        description="Provider of satellite pictures for `location_to_imagery`; only its host is asked. Tiles: an "
+        "address with `{z}`, `{x}`, `{y}` (or `{-y}`; WMTS: `{TileMatrix}`, `{TileCol}`, `{TileRow}`); a WMS with "
+        "`layers=…`; a Mapbox style up to `/static`. `{token}` stands for the token. Unset: none is asked.",
+    )
+    imagery_kind: Literal["xyz", "wms", "mapbox"] = Field(
+        default="xyz",
+        description="What the provider speaks: `xyz` (tiles, WMTS too), `wms`, or `mapbox` static images.",
+    )
+    imagery_token: SecretStr | None = Field(default=None, description="The provider's token.")
+    imagery_attribution: str = Field(
+        default="", description="Credits of its pictures, separated by `;`. They go into maps and reports."
+    )
+    imagery_max_bytes: int = Field(
+        default=64 * 2**20, ge=1024, description="Most bytes that are fetched for one picture of a site."
+    )
+    imagery_seconds: float = Field(default=60.0, gt=0, le=600, description="Longest time for fetching such a picture.")
+    imagery_tries: int = Field(
+        default=3, ge=1, le=10, description="How often the provider is asked before it counts as down."
+    )
+    imagery_max_zoom: int = Field(default=19, ge=0, le=24, description="Finest zoom level that the provider has.")
+    imagery_tile_size: int = Field(default=256, ge=64, le=2048, description="Pixels along a side of its tiles (`xyz`).")
+    imagery_cache_bytes: int = Field(
+        default=256 * 2**20, ge=0, description="Room in the data folder for what was fetched; 0: nothing is kept."
+    )
+
     manifest_seconds: float = Field(
         default=86_400.0,
         ge=3600,
@@ -177,7 +204,9 @@ class Settings(BaseSettings):
     )
     max_warnings: int = Field(default=_DEFAULTS.warnings, ge=1, description="Most warnings kept with one version.")
 
-    @field_validator("database_url", "blob_url", "admin_token", "zenoh_config", mode="before")
+    @field_validator(
+        "database_url", "blob_url", "admin_token", "zenoh_config", "imagery_url", "imagery_token", mode="before"
+    )
     @classmethod
     def _empty_is_unset(cls, value: Any) -> Any:
         return None if value == "" else value
@@ -202,6 +231,22 @@ class Settings(BaseSettings):
     def _client_needs_a_router(self) -> Self:
         if self.zenoh_mode == "client" and not self.zenoh_connect.strip():
             raise ValueError("zenoh_mode client needs zenoh_connect: where the router is, like tcp/router:7447")
+        return self
+
+    @model_validator(mode="after")
+    def _imagery_url_is_complete(self) -> Self:
+        if self.imagery_url is None:
+            return self
+        parts = urlsplit(self.imagery_url)
+        if parts.scheme not in ("http", "https") or not parts.hostname or "{" in parts.netloc:
+            raise ValueError("imagery_url must be a full address: https://host/…")
+        query = {key.upper() for key in parse_qs(parts.query, keep_blank_values=True)}
+        rows = ("{y}", "{-y}", "{TileRow}")
+        tiled = [("{z}", "{TileMatrix}"), ("{x}", "{TileCol}"), rows]
+        if self.imagery_kind == "xyz" and not all(any(n in self.imagery_url for n in names) for names in tiled):
+            raise ValueError("imagery_url of tiles needs {z}, {x} and {y} (or {-y}; WMTS: {TileMatrix} …)")
+        if self.imagery_kind == "wms" and "LAYERS" not in query:
+            raise ValueError("imagery_url of a WMS needs its layers: https://host/wms?layers=…")
         return self
 
     @property

@@ -64,7 +64,7 @@ from app.events.bus import Bus, BusOptions
 from app.events.relay import Relay
 from app.fleet import Intake as FleetIntake
 from app.fleet import decide
-from app.ingest import Ingest
+from app.ingest import Ingest, Provider
 from app.pool import Pool
 from app.sandbox import Allowed
 from app.signing import Keys
@@ -261,7 +261,7 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         ),
         store=store,
         pool=pool,
-        ingest=Ingest(store, pool.run, settings.limits),
+        ingest=Ingest(store, pool.run, settings.limits, provider_of(settings)),
         maps=service,
         access=access,
         work=Work(store, service, settings.job_seconds, count),
@@ -271,6 +271,25 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         keys=Keys(settings.data_dir / "keys"),
         deltas=Deltas(service.cache),
         fleet=FleetIntake(store),
+    )
+
+
+def provider_of(settings: Settings) -> Provider | None:
+    """Where pictures of sites are fetched; None where the operator has set up none."""
+    if settings.imagery_url is None:
+        return None
+    return Provider(
+        url=settings.imagery_url,
+        kind=settings.imagery_kind,
+        token=settings.imagery_token.get_secret_value() if settings.imagery_token else "",
+        attribution=tuple(text.strip() for text in settings.imagery_attribution.split(";") if text.strip()),
+        max_bytes=settings.imagery_max_bytes,
+        seconds=settings.imagery_seconds,
+        tries=settings.imagery_tries,
+        max_zoom=settings.imagery_max_zoom,
+        tile=settings.imagery_tile_size,
+        cache_dir=settings.data_dir / "imagery" if settings.imagery_cache_bytes else None,
+        cache_bytes=settings.imagery_cache_bytes,
     )
 
 

@@ -15,7 +15,7 @@ from app.api.services import Here
 from app.api.versions import told_as
 from app.derive import Derivation
 from app.errors import Invalid, NotFound, Problem
-from app.ingest import Wish
+from app.ingest import Wish, online
 
 router = APIRouter(tags=["derivations"], route_class=Route)
 
@@ -33,10 +33,24 @@ def as_dict(known: Derivation) -> dict[str, Any]:
     }
 
 
+def as_online() -> dict[str, Any]:
+    """The one that asks a provider on the net; no map takes it by itself."""
+    return {
+        "id": online.METHOD,
+        "title": "A picture of the site from the configured provider.",
+        "gives": "imagery",
+        "needs": ["location"],
+        "cost": 100.0,
+        "version": 1,
+        "parameters": parameters.describe(online.Parameters),
+    }
+
+
 @router.get("/derivations", responses=told(list[DerivationOut]), summary="All derivations")
-def list_derivations(_: Viewer) -> Response:
+def list_derivations(here: Here, _: Viewer) -> Response:
     """What can be computed from what. Maps use them by themselves; their parameters go into a map's query."""
-    return answer([as_dict(known) for known in derive.all_derivations().values()])
+    known = [as_dict(one) for one in derive.all_derivations().values()]
+    return answer(known + ([as_online()] if here.ingest.provider is not None else []))
 
 
 @router.post(
@@ -58,11 +72,13 @@ def create_derivation(
 ) -> Response:
     """A version whose provenance says how the layer was made and from what. It goes stale when that changes.
 
-    409 where a source has told that layer, unless `replace` is true.
+    409 where a source has told that layer, unless `replace` is true. `location_to_imagery` fetches a picture of the
+    site where the operator has set up a provider (503 while that is down); it never goes stale.
     """
     wish = Wish(body.method, body.parameters, body.replace)
     try:
-        outcome = here.ingest.derive(
+        carry_out = here.ingest.fetch_imagery if body.method == online.METHOD else here.ingest.derive
+        outcome = carry_out(
             env, wish, message=body.message, author=who.name, if_match=if_match, idempotency=idempotency_key
         )
     except NotFound as error:

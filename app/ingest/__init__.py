@@ -4,6 +4,7 @@
 """
 
 from app.ingest.derivation import Wish
+from app.ingest.online import Provider
 from app.ingest.service import Ingest, Outcome, SpooledFile, Upload
 
-__all__ = ["Ingest", "Outcome", "SpooledFile", "Upload", "Wish"]
+__all__ = ["Ingest", "Outcome", "Provider", "SpooledFile", "Upload", "Wish"]

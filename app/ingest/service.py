@@ -10,10 +10,11 @@ from typing import Any, Literal
 
 import orjson
 
-from app import formats
+from app import formats, parameters
 from app.bundle import Hints
-from app.errors import Conflict, Invalid, Problem, StaleParent, UnreadableFile
+from app.errors import CannotDerive, Conflict, Invalid, Problem, StaleParent, UnreadableFile
 from app.formats import Limits
+from app.ingest import online
 from app.ingest.derivation import Wish, prepare_derivation
 from app.ingest.derivation import check as check_wish
 from app.ingest.edits import edit_changes
@@ -75,8 +76,9 @@ class Outcome:
 class Ingest:
     """All ways to make a version."""
 
-    def __init__(self, store: Store, run: Run, limits: Limits) -> None:
+    def __init__(self, store: Store, run: Run, limits: Limits, provider: online.Provider | None = None) -> None:
         self._store, self._run, self._limits = store, run, limits
+        self.provider = provider
 
     def upload(
         self,
@@ -179,6 +181,54 @@ class Ingest:
                 if last:
                     raise
         raise StaleParent(f"{environment} changes faster than a layer can be derived: try again")
+
+    def fetch_imagery(
+        self,
+        environment: str,
+        wish: Wish,
+        *,
+        message: str,
+        author: str,
+        if_match: str | None = None,
+        idempotency: str | None = None,
+    ) -> Outcome:
+        """A picture of the site from the configured provider -> one version.
+
+        Raises CannotDerive (no provider, or what it sends is of no use), MissingLayer or MissingDatum, Invalid,
+        Unavailable (the provider is down), Conflict, StaleParent.
+        """
+        if self.provider is None:
+            raise CannotDerive(
+                "no imagery provider is set up: the operator sets FLEETMAP_IMAGERY_URL, FLEETMAP_IMAGERY_KIND and, "
+                "where it needs one, FLEETMAP_IMAGERY_TOKEN",
+                step=online.METHOD,
+            )
+        chosen = parameters.parse(online.Parameters, wish.values, f"parameter of {online.METHOD}")
+        key = _idempotency(idempotency, _digest(["fetch", dict(wish.values), wish.replace, message]))
+        replayed = self._replayed(environment, key)
+        if replayed is not None:
+            return replayed
+        asked: online.Sheet | None = None
+        answers: tuple[bytes | None, ...] = ()
+        for last in _tries(if_match):
+            base = self._store.version(environment)
+            check_if_match(if_match, base)
+            online.check_free(base, chosen, replace=wish.replace)
+            site = self._store.load(base, sorted(e.key for e in base.parts if e.key.layer == "location" and e.count))
+            sheet = online.sheet(self.provider, online.site_box(site, chosen), chosen.resolution)
+            if sheet != asked:
+                asked, answers = sheet, tuple(online.Fetcher(self.provider).fetch(sheet.blocks))
+            fetched = online.Fetched(sheet, answers, chosen, self.provider.told(chosen), self.provider.attribution)
+            prepared, warnings = self._in_worker(
+                online.prepare_picture, base, fetched, self._limits, what="the fetched picture could not be read"
+            )
+            try:
+                text = message or f"Fetched from {self.provider.host}"
+                return self._commit(environment, base, prepared, author, text, (), warnings, key)
+            except StaleParent:
+                if last:
+                    raise
+        raise StaleParent(f"{environment} changes faster than a picture can be fetched: try again")
 
     def revert(
         self,

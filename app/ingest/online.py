@@ -1,0 +1,513 @@
+"""Pictures from a provider on the net, fetched for a site: Mapbox static images, WMS, and tiles (XYZ or WMTS).
+
+Off unless an operator names a provider, and then only its host is asked: a redirect to another one is refused. Answers
+are untrusted: their size and time are bounded before they are read, and they are decoded in a worker process, as
+uploads are. All pictures come in Web Mercator (EPSG:3857). The token goes into addresses that are asked for, and
+nowhere else: no message, log, cache or version has it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import math
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import parse_qsl, quote, urlencode, urljoin, urlsplit, urlunsplit
+
+import httpx
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app import bundle
+from app.bundle import Hints, Known
+from app.errors import (
+    BadUpload,
+    CannotDerive,
+    Conflict,
+    Invalid,
+    MissingDatum,
+    MissingLayer,
+    Problem,
+    Unavailable,
+)
+from app.formats import Limits
+from app.ingest.prepare import open_store
+from app.model.geodesy import WGS84, between
+from app.model.imagery import Picture
+from app.model.layers import Layers, PartKey
+from app.parameters import describe, parameter
+from app.store.changes import Changes, Prepared, Provenance, Replace
+from app.store.values import Version
+
+METHOD = "location_to_imagery"
+MERCATOR = "EPSG:3857"
+HALF = 20037508.342789244
+"""Metres from the middle to the edge of the Web Mercator square."""
+
+Kind = Literal["xyz", "wms", "mapbox"]
+BLOCK: Mapping[str, int] = {"wms": 2048, "mapbox": 1280}
+"""Pixels along a side of one picture that such a provider makes at most."""
+
+MAPBOX_TILE = 512
+"""Pixels of a tile by which Mapbox counts its zoom levels."""
+
+MOST_REQUESTS = 400
+MOST_PIXELS = 2**26
+AT_ONCE = 4
+REDIRECTS = 3
+LONGEST_WAIT = 10.0
+
+MAGIC: Mapping[bytes, str] = {b"\x89PNG\r\n\x1a\n": "png", b"\xff\xd8\xff": "jpg"}
+
+
+@dataclass(frozen=True, slots=True)
+class Provider:
+    """Where pictures come from. url: of tiles with {z}, {x}, {y} (or {-y}, from below; or WMTS's {TileMatrix},
+    {TileCol}, {TileRow}), of a WMS with its layers in the query, or of a Mapbox style up to ``static``. token: in the
+    place of {token}, else for Mapbox as access_token. seconds: for all requests of one picture. tile: pixels a side."""
+
+    url: str
+    kind: Kind
+    token: str = ""
+    attribution: tuple[str, ...] = ()
+    max_bytes: int = 64 * 2**20
+    seconds: float = 60.0
+    tries: int = 3
+    max_zoom: int = 19
+    tile: int = 256
+    cache_dir: Path | None = None
+    cache_bytes: int = 256 * 2**20
+
+    @property
+    def host(self) -> str:
+        """The only host that is asked."""
+        return urlsplit(self.url).netloc.rpartition("@")[2]
+
+    def told(self, chosen: Parameters) -> dict[str, Any]:
+        """The step as a version's provenance says it."""
+        said = {p["name"]: getattr(chosen, p["name"]) for p in describe(Parameters)}
+        said |= {"provider": self.host, "kind": self.kind}
+        return {"step": METHOD, "from": ["location"], "to": "imagery", "parameters": said}
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """What picture."""
+
+    resolution: float = parameter(
+        0.3, "metres a pixel on the ground; tiles come in the next finer zoom", minimum=0.01, maximum=1000.0, unit="m"
+    )
+    padding: float = parameter(10.0, "around the fence", minimum=0.0, maximum=10_000.0, unit="m")
+    radius: float | None = parameter(
+        None, "where there is no fence: how far from the datum to each side", minimum=1.0, maximum=50_000.0, unit="m"
+    )
+    picture: str = parameter("satellite", "name to store the picture under")
+    level: str = parameter("ground", "level of the picture")
+
+    @property
+    def key(self) -> PartKey:
+        """The part that it becomes."""
+        return PartKey("imagery", self.level, self.picture)
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One request: its place and size in the picture's pixels, and its address without the token."""
+
+    column: int
+    row: int
+    width: int
+    height: int
+    url: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """All requests of a picture, its size in pixels and its transform in Web Mercator."""
+
+    blocks: tuple[Block, ...]
+    width: int
+    height: int
+    transform: tuple[float, float, float, float, float, float]
+
+
+# --- the site ---------------------------------------------------------------------------------------------------------
+def check_free(base: Version, chosen: Parameters, *, replace: bool) -> None:
+    """Conflict where a source has told a picture of that name."""
+    own = {e.key: e for e in base.parts if e.count > 0}.get(chosen.key)
+    if own is not None and not replace and (own.provenance.information != "derived" or own.provenance.edited):
+        raise Conflict(
+            f"the picture {chosen.level}/{chosen.picture} is {own.provenance.information}: to put a fetched one in its "
+            "place, ask with replace=true, or name another picture"
+        )
+
+
+def site_box(site: Layers, chosen: Parameters) -> tuple[float, float, float, float]:
+    """West, south, east, north of the fence with its padding, in degrees. MissingDatum, or MissingLayer."""
+    frame = site.frame
+    if frame is None:
+        raise MissingDatum('a picture of the site needs its place on earth: PATCH the environment with {"datum": {…}}')
+    areas = [area for part in site.vector("location").values() for area in part.in_local(frame)]
+    boxes = shapely.bounds([a for a in areas if shapely.get_dimensions(a) == 2 and not a.is_empty])
+    if len(boxes):
+        low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
+    elif chosen.radius is not None:
+        low, high = np.full(2, -chosen.radius), np.full(2, chosen.radius)
+    else:
+        raise MissingLayer("there is no fence around the site: upload one as location, or ask with radius=… (metres)")
+    (x0, y0), (x1, y1) = low - chosen.padding, high + chosen.padding
+    lonlat = frame.to_wgs84(np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
+    (west, south), (east, north) = lonlat.min(axis=0), lonlat.max(axis=0)
+    return float(west), float(south), float(east), float(north)
+
+
+# --- what to ask for -------------------------------------------------------------------------------------------------
+def sheet(provider: Provider, box: tuple[float, float, float, float], resolution: float) -> Sheet:
+    """The requests that cover a box (west, south, east, north in degrees). Invalid where they would be too many."""
+    west, south, east, north = box
+    if not (-180 <= west < east <= 180 and -85.05 <= south < north <= 85.05):
+        raise Invalid("the site lies where Web Mercator has no pictures: across the date line or at a pole")
+    low, high = between(WGS84, MERCATOR, np.array([[west, south], [east, north]])).tolist()
+    stretch = 1.0 / math.cos(math.radians((south + north) / 2))
+    zoom, size = 0, resolution * stretch
+    if provider.kind != "wms":
+        whole = 2 * HALF / (MAPBOX_TILE if provider.kind == "mapbox" else provider.tile)
+        zoom = min(max(math.ceil(math.log2(whole / size) - 1e-9), 0), provider.max_zoom)
+        size = whole / 2**zoom
+    left, right = math.floor((low[0] + HALF) / size), math.ceil((high[0] + HALF) / size)
+    top, bottom = math.floor((HALF - high[1]) / size), math.ceil((HALF - low[1]) / size)
+    width, height = right - left, bottom - top
+    side = provider.tile if provider.kind == "xyz" else BLOCK[provider.kind]
+    count = (math.ceil(width / side) + 1) * (math.ceil(height / side) + 1)
+    if count > MOST_REQUESTS or width * height > MOST_PIXELS:
+        said = f"{width} × {height} pixels in about {count} requests"
+        raise Invalid(
+            f"the picture would have {said}; at most {MOST_PIXELS} pixels and {MOST_REQUESTS} requests are made: give "
+            "a coarser resolution",
+            [Problem("too fine for a site of this size", where="resolution")],
+        )
+    make = {"xyz": _tiles, "wms": _maps, "mapbox": _statics}[provider.kind]
+    blocks = tuple(make(provider, (left, top, right, bottom), size, zoom))
+    return Sheet(blocks, width, height, (size, 0.0, left * size - HALF, 0.0, -size, HALF - top * size))
+
+
+Edges = tuple[int, int, int, int]
+
+
+def _tiles(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[Block]:  # noqa: ARG001
+    left, top, right, bottom = edges
+    side, count = provider.tile, 2**zoom
+    for y in range(top // side, -(-bottom // side)):
+        for x in range(left // side, -(-right // side)):
+            values = {"z": zoom, "x": x, "y": y, "-y": count - 1 - y, "TileMatrix": zoom, "TileCol": x, "TileRow": y}
+            url = provider.url
+            for name, value in values.items():
+                url = url.replace(f"{{{name}}}", str(value))
+            yield Block(x * side - left, y * side - top, side, side, url)
+
+
+def _maps(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[Block]:  # noqa: ARG001
+    said = dict(parse_qsl(urlsplit(provider.url).query, keep_blank_values=True))
+    upper = {key.upper() for key in said}
+    usual = {"SERVICE": "WMS", "VERSION": "1.3.0", "REQUEST": "GetMap", "STYLES": "", "FORMAT": "image/jpeg"}
+    query = {**{key: value for key, value in usual.items() if key not in upper}, **said}
+    old = next((value for key, value in said.items() if key.upper() == "VERSION"), "1.3.0") < "1.3"
+    for column, row, w, h in _cut(edges, BLOCK["wms"]):
+        x, y = (edges[0] + column) * size - HALF, HALF - (edges[1] + row) * size
+        box = ",".join(f"{v:.9f}" for v in (x, y - h * size, x + w * size, y))
+        asked = {**query, "SRS" if old else "CRS": MERCATOR, "BBOX": box, "WIDTH": str(w), "HEIGHT": str(h)}
+        yield Block(column, row, w, h, _with_query(provider.url, asked))
+
+
+def _statics(provider: Provider, edges: Edges, size: float, zoom: int) -> Iterator[Block]:
+    parts = urlsplit(provider.url)
+    for column, row, w, h in _cut(edges, BLOCK["mapbox"]):
+        middle = [(edges[0] + column + w / 2) * size - HALF, HALF - (edges[1] + row + h / 2) * size]
+        ((lon, lat),) = between(MERCATOR, WGS84, np.array([middle])).tolist()
+        path = f"{parts.path.rstrip('/')}/{lon:.9f},{lat:.9f},{zoom}/{w}x{h}"
+        yield Block(column, row, w, h, urlunsplit(parts._replace(path=path)))
+
+
+def _cut(edges: Edges, side: int) -> Iterator[tuple[int, int, int, int]]:
+    """(column, row, width, height) of blocks of at most a side."""
+    width, height = edges[2] - edges[0], edges[3] - edges[1]
+    for row in range(0, height, side):
+        for column in range(0, width, side):
+            yield column, row, min(side, width - column), min(side, height - row)
+
+
+def _with_query(url: str, query: Mapping[str, str]) -> str:
+    # What stands in braces is filled in later.
+    return urlunsplit(urlsplit(url)._replace(query=urlencode(query, safe="{}:,/")))
+
+
+# --- asking -----------------------------------------------------------------------------------------------------------
+class _AgainError(Exception):
+    """It may work another time. The text says what was wrong; wait: seconds that the provider asks for."""
+
+    def __init__(self, text: str, wait: float = 0.0) -> None:
+        super().__init__(text)
+        self.wait = wait
+
+
+class Fetcher:
+    """Asks a provider, within its limits."""
+
+    def __init__(self, provider: Provider, *, sleep: Callable[[float], None] = time.sleep) -> None:
+        self.provider, self._sleep = provider, sleep
+        # Their lines of every request would have the token.
+        for name in ("httpx", "httpcore"):
+            logging.getLogger(name).setLevel(logging.WARNING)
+
+    def fetch(self, blocks: Sequence[Block]) -> list[bytes | None]:
+        """The pictures of all blocks, None where the provider has none (404).
+
+        Raises CannotDerive where it refuses or sends something else, Unavailable where it is down or too slow.
+        """
+        p = self.provider
+        deadline = time.monotonic() + p.seconds
+        room = _Room(p.max_bytes)
+        timeout = httpx.Timeout(min(20.0, p.seconds))
+        headers = {"Accept": "image/png, image/jpeg", "Accept-Encoding": "identity", "User-Agent": "fleet-map-server"}
+        with (
+            httpx.Client(timeout=timeout, headers=headers, follow_redirects=False) as client,
+            ThreadPoolExecutor(AT_ONCE) as threads,
+        ):
+            waiting = [threads.submit(self._one, client, block, deadline, room) for block in blocks]
+            try:
+                return [one.result() for one in waiting]
+            except BaseException:
+                for one in waiting:
+                    one.cancel()
+                room.stopped.set()
+                raise
+
+    def _one(self, client: httpx.Client, block: Block, deadline: float, room: _Room) -> bytes | None:
+        known = self._cached(block)
+        if known is not None:
+            return known
+        for k in range(self.provider.tries):
+            try:
+                data = self._asked(client, block, deadline, room)
+                break
+            except _AgainError as error:
+                wait = max(0.5 * 2**k, min(error.wait, LONGEST_WAIT))
+                last = k + 1 == self.provider.tries
+                if last or room.stopped.is_set() or time.monotonic() + wait > deadline:
+                    raise Unavailable(f"the imagery provider {self.provider.host} {error}: try again later") from None
+                self._sleep(wait)
+        if data is not None:
+            self._keep(block, data)
+        return data
+
+    def _asked(self, client: httpx.Client, block: Block, deadline: float, room: _Room) -> bytes | None:
+        """One answer. The address with the token is in no message."""
+        url = self._address(block.url)
+        try:
+            for _ in range(REDIRECTS + 1):
+                with client.stream("GET", url) as answer:
+                    if answer.is_redirect:
+                        url = self._led_to(url, answer.headers.get("location", ""))
+                        continue
+                    return self._body(answer, deadline, room)
+        except httpx.TimeoutException:
+            raise _AgainError("does not answer in time") from None
+        except httpx.InvalidURL:
+            raise self._wrong("leads to an address that is none") from None
+        except httpx.HTTPError as error:
+            raise _AgainError(f"cannot be reached ({type(error).__name__})") from None
+        raise self._wrong(f"redirects more than {REDIRECTS} times")
+
+    def _address(self, url: str) -> str:
+        """The address with the token in it."""
+        token = quote(self.provider.token, safe="")
+        if self.provider.kind == "mapbox" and "{token}" not in url and token:
+            return f"{url}{'&' if '?' in url else '?'}access_token={token}"
+        return url.replace("{token}", token)
+
+    def _led_to(self, url: str, location: str) -> str:
+        there = urljoin(url, location)
+        old, new = urlsplit(url), urlsplit(there)
+        if (old.scheme, old.netloc) != (new.scheme, new.netloc):
+            raise self._wrong("redirects to another host, which is not followed")
+        return there
+
+    def _body(self, answer: httpx.Response, deadline: float, room: _Room) -> bytes | None:
+        status = answer.status_code
+        if status == 404:
+            return None
+        if status in (401, 403):
+            raise self._wrong(f"refuses ({status}): check FLEETMAP_IMAGERY_TOKEN and what it allows")
+        if status == 429 or status >= 500:
+            said = answer.headers.get("retry-after", "")
+            raise _AgainError(f"answers {status}", float(said) if said.isascii() and said.isdigit() else 0.0)
+        if status != 200:
+            raise self._wrong(f"answers {status}")
+        kind = answer.headers.get("content-type", "").partition(";")[0].strip().lower()[:80]
+        if kind and not kind.startswith("image/") and kind != "application/octet-stream":
+            raise self._wrong(f"sends {kind!r} instead of a picture: check FLEETMAP_IMAGERY_URL")
+        if answer.headers.get("content-encoding", "identity").lower() != "identity":
+            raise self._wrong("sends a compressed answer that was not asked for")
+        length = answer.headers.get("content-length", "")
+        if length.isascii() and length.isdigit() and int(length) > self.provider.max_bytes:
+            raise self._too_large()
+        out = bytearray()
+        # As it comes: chunks of a given size would be waited for, however slowly they drip.
+        for chunk in answer.iter_raw():
+            if not room.take(len(chunk)):
+                raise self._too_large()
+            out += chunk
+            if time.monotonic() > deadline:
+                raise _AgainError(f"has not sent everything within {self.provider.seconds:g} s")
+        data = bytes(out)
+        if not any(data.startswith(magic) for magic in MAGIC):
+            raise self._wrong("sends what is neither PNG nor JPEG: check FLEETMAP_IMAGERY_URL")
+        return data
+
+    def _wrong(self, problem: str) -> CannotDerive:
+        return CannotDerive(f"the imagery provider {self.provider.host} {problem}", step=METHOD)
+
+    def _too_large(self) -> CannotDerive:
+        most = self.provider.max_bytes
+        return self._wrong(f"sends more than FLEETMAP_IMAGERY_MAX_BYTES ({most}): ask for a coarser resolution")
+
+    # --- what was fetched before ---
+    def _file(self, block: Block) -> Path | None:
+        folder = self.provider.cache_dir
+        return None if folder is None else folder / hashlib.sha256(block.url.encode()).hexdigest()
+
+    def _cached(self, block: Block) -> bytes | None:
+        file = self._file(block)
+        if file is None:
+            return None
+        try:
+            data = file.read_bytes()
+            os.utime(file)
+        except OSError:
+            return None
+        return data if any(data.startswith(magic) for magic in MAGIC) else None
+
+    def _keep(self, block: Block, data: bytes) -> None:
+        """Remember an answer; what was not used for the longest time goes. A full disk is no reason to fail."""
+        file = self._file(block)
+        if file is None or len(data) > self.provider.cache_bytes:
+            return
+        with contextlib.suppress(OSError):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            part = file.with_suffix(f".{threading.get_ident()}.part")
+            part.write_bytes(data)
+            part.replace(file)
+            _trim(file.parent, self.provider.cache_bytes)
+
+
+class _Room:
+    """Bytes that all answers of a picture together may have."""
+
+    def __init__(self, most: int) -> None:
+        self._left, self._lock = most, threading.Lock()
+        self.stopped = threading.Event()
+
+    def take(self, count: int) -> bool:
+        """Whether there is room for so many more."""
+        with self._lock:
+            self._left -= count
+            return self._left >= 0
+
+
+def _trim(folder: Path, most: int) -> None:
+    known = []
+    for file in folder.iterdir():
+        with contextlib.suppress(OSError):
+            said = file.stat()
+            known.append((said.st_mtime_ns, said.st_size, file))
+    total = sum(size for _, size, _ in known)
+    for _, size, file in sorted(known):
+        if total <= most:
+            return
+        with contextlib.suppress(OSError):
+            file.unlink()
+        total -= size
+
+
+# --- in a worker ------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class Fetched:
+    """What a provider sent, and what is to become of it. told: the step as the version's provenance says it."""
+
+    sheet: Sheet
+    answers: tuple[bytes | None, ...]
+    chosen: Parameters
+    told: Mapping[str, Any]
+    attribution: tuple[str, ...]
+
+
+def prepare_picture(
+    database_url: str, blob_dir: str, base: Version, fetched: Fetched, limits: Limits
+) -> tuple[Prepared, tuple[Problem, ...]]:
+    """In a worker: decode what a provider sent, put it together, and prepare the version that has it.
+
+    Raises CannotDerive for an answer that is no picture of the size that was asked for.
+    """
+    picture, missing = put_together(fetched.sheet, fetched.answers, fetched.attribution, limits)
+    warnings = []
+    if missing:
+        why = f"the provider has no picture for {missing} of {len(fetched.answers)} parts: they are transparent"
+        warnings.append(Problem(why))
+    provenance = Provenance("derived", None, (), None, (dict(fetched.told),), fetched.attribution, ())
+    store = open_store(database_url, blob_dir)
+    return store.prepare(base, Changes((Replace(fetched.chosen.key, picture, provenance),))), tuple(warnings)
+
+
+def put_together(
+    asked: Sheet, answers: Iterable[bytes | None], attribution: tuple[str, ...], limits: Limits
+) -> tuple[Picture, int]:
+    """(the picture, how many of its parts the provider does not have). CannotDerive where it has none."""
+    pixels = np.zeros((asked.height, asked.width, 4), np.uint8)
+    missing = 0
+    for block, data in zip(asked.blocks, answers, strict=True):
+        if data is None:
+            missing += 1
+            continue
+        shown = _decoded(block, data, limits)
+        row, column = max(block.row, 0), max(block.column, 0)
+        end, right = min(block.row + block.height, asked.height), min(block.column + block.width, asked.width)
+        inner = shown[row - block.row : end - block.row, column - block.column : right - block.column]
+        pixels[row:end, column:right] = inner
+    if missing == len(asked.blocks):
+        raise CannotDerive("the imagery provider has no picture of this place at this resolution", step=METHOD)
+    said = {"attribution": list(attribution)} if attribution else {}
+    whole = pixels if (pixels[..., 3] < 255).any() else np.ascontiguousarray(pixels[..., :3])
+    return Picture(whole, asked.transform, MERCATOR, said), missing
+
+
+def _decoded(block: Block, data: bytes, limits: Limits) -> NDArray[np.uint8]:
+    """An answer's pixels as RGBA: uint8 [height, width, 4]. It is read as an upload is."""
+    end = next(kind for magic, kind in MAGIC.items() if data.startswith(magic))
+    name = f"answer.{end}"
+    hints = Hints(format="satellite", options={"metres_per_pixel": "1"})
+    try:
+        (part,) = bundle.read({name: data}, hints, Known(), limits).layers(None).parts.values()
+    except (BadUpload, ValueError) as error:
+        raise CannotDerive(f"the imagery provider sends a picture that cannot be read: {error}", step=METHOD) from error
+    assert isinstance(part, Picture)
+    height, width, bands = part.pixels.shape
+    if (height, width) != (block.height, block.width) or part.pixels.dtype != np.uint8:
+        raise CannotDerive(
+            f"the imagery provider sends a picture of {width} × {height} pixels instead of {block.width} × "
+            f"{block.height}: check FLEETMAP_IMAGERY_TILE_SIZE",
+            step=METHOD,
+        )
+    out = np.full((height, width, 4), 255, np.uint8)
+    out[..., :3] = part.pixels[..., :3] if bands >= 3 else part.pixels[..., :1]
+    if bands in (2, 4):
+        out[..., 3] = part.pixels[..., -1]
+    return out

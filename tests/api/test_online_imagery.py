@@ -1,0 +1,420 @@
+"""Pictures from a provider: against a server of our own that speaks its protocol, and one that misbehaves."""
+
+from __future__ import annotations
+
+import io
+import re
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from app.errors import CannotDerive, Invalid, Unavailable
+from app.formats import Limits
+from app.ingest import online
+from app.ingest.online import Fetcher, Provider, put_together, sheet
+from app.model.geodesy import WGS84, between
+from app.model.imagery import Picture, placed
+from tests.api.conftest import Api, running, settings_for
+
+FENCE = """<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>fence</name><Polygon><outerBoundaryIs>
+<LinearRing><coordinates>-0.5251,53.2682 -0.5240,53.2682 -0.5240,53.2688 -0.5251,53.2688 -0.5251,53.2682</coordinates>
+</LinearRing></outerBoundaryIs></Polygon></Placemark></Document></kml>"""
+BOX = (-0.5251, 53.2682, -0.5240, 53.2688)
+
+
+def chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+BOMB = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 60000, 60000, 8, 2, 0, 0, 0))
+BOMB += chunk(b"IDAT", zlib.compress(bytes(2**20))) + chunk(b"IEND", b"")
+SECRET = "pk.very-secret"
+
+
+def world(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """The colour of a place in Web Mercator metres: blocks of 16 m, so that every pixel tells where it lies."""
+    return np.stack([(x // 16) % 256, (y // 16) % 256, (x // 16 + y // 16) % 256], axis=-1).astype(np.uint8)
+
+
+def drawn(left: float, top: float, size: float, width: int, height: int) -> bytes:
+    x, y = np.meshgrid(left + (np.arange(width) + 0.5) * size, top - (np.arange(height) + 0.5) * size)
+    out = io.BytesIO()
+    Image.fromarray(world(x, y)).save(out, "PNG")
+    return out.getvalue()
+
+
+@dataclass
+class Misbehaving:
+    """A provider. mood: what it does; asked: the paths that came."""
+
+    url: str = ""
+    mood: str = "fine"
+    asked: list[str] = field(default_factory=list)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    gone: threading.Event = field(default_factory=threading.Event)
+
+
+def picture_for(path: str) -> bytes:
+    """What a good provider answers."""
+    parts = urlsplit(path)
+    query = {key.upper(): values[0] for key, values in parse_qs(parts.query).items()}
+    tile = re.match(r"/tiles/(\d+)/(\d+)/(\d+)\.png", parts.path)
+    if tile:
+        z, x, y = map(int, tile.groups())
+        size = 2 * online.HALF / (256 * 2**z)
+        return drawn(x * 256 * size - online.HALF, online.HALF - y * 256 * size, size, 256, 256)
+    static = re.match(r"/styles/static/([-\d.]+),([-\d.]+),(\d+)/(\d+)x(\d+)", parts.path)
+    if static:
+        lon, lat, z, w, h = (float(v) for v in static.groups())
+        size = 2 * online.HALF / (512 * 2**z)
+        ((x, y),) = between(WGS84, online.MERCATOR, np.array([[lon, lat]]))
+        return drawn(x - w / 2 * size, y + h / 2 * size, size, int(w), int(h))
+    assert query["REQUEST"] == "GetMap"
+    assert query["LAYERS"] == "ortho"
+    assert query["CRS"] == "EPSG:3857"
+    west, south, east, north = map(float, query["BBOX"].split(","))
+    w, h = int(query["WIDTH"]), int(query["HEIGHT"])
+    assert (east - west) / w == pytest.approx((north - south) / h)
+    return drawn(west, north, (east - west) / w, w, h)
+
+
+@pytest.fixture
+def provider() -> Iterator[Misbehaving]:
+    state = Misbehaving()
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+        def send(self, status: int, body: bytes, kind: str = "image/png", **headers: str) -> None:
+            self.send_response(status)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", headers.pop("length", str(len(body))))
+            for name, value in headers.items():
+                self.send_header(name.replace("_", "-"), value)
+            self.end_headers()
+            self.wfile.write(body)
+
+        def do_GET(self) -> None:
+            with state.lock:
+                state.asked.append(self.path)
+                count = len(state.asked)
+            mood = state.mood
+            try:
+                if mood == "fine" or (mood == "busy" and count > 2) or (mood == "led" and "moved" in self.path):
+                    self.send(200, picture_for(self.path.replace("/moved", "")))
+                elif mood == "forbidden":
+                    self.send(403, b"{}", "application/json")
+                elif mood in ("broken", "busy"):
+                    self.send(503, b"", Retry_After="0")
+                elif mood == "html":
+                    self.send(200, b"<html>sign in</html>", "text/html; charset=utf-8")
+                elif mood == "disguised":
+                    self.send(200, b"<html>sign in</html>")
+                elif mood == "huge":
+                    self.send(200, b"\x89PNG\r\n\x1a\n", length=str(10 * 2**30))
+                    self.close_connection = True
+                elif mood == "endless":
+                    self.send_response(200)
+                    self.send_header("Content-Type", "image/png")
+                    self.send_header("Connection", "close")
+                    self.end_headers()
+                    self.close_connection = True
+                    while not state.gone.is_set():
+                        self.wfile.write(b"\x89PNG\r\n\x1a\n" + bytes(2**16))
+                elif mood == "dripping":
+                    self.send_response(200)
+                    self.send_header("Content-Length", "1000000")
+                    self.end_headers()
+                    self.close_connection = True
+                    while not state.gone.is_set():
+                        self.wfile.write(b"x")
+                        time.sleep(0.05)
+                elif mood == "silent":
+                    state.gone.wait(20)
+                    self.close_connection = True
+                elif mood == "elsewhere":
+                    self.send(302, b"", Location="http://169.254.169.254/latest/meta-data/")
+                elif mood == "led":
+                    self.send(302, b"", Location="/moved" + self.path)
+                elif mood == "circle":
+                    self.send(302, b"", Location=self.path)
+                elif mood == "missing":
+                    self.send(404, b"")
+                elif mood == "patchy":
+                    if count == 1:
+                        self.send(404, b"")
+                    else:
+                        self.send(200, picture_for(self.path))
+                elif mood == "small":
+                    self.send(200, drawn(0, 0, 1, 64, 64))
+                elif mood == "torn":
+                    self.send(200, picture_for(self.path)[:200])
+                elif mood == "bomb":
+                    self.send(200, BOMB)
+                else:
+                    raise AssertionError(mood)
+            except (BrokenPipeError, ConnectionResetError):
+                self.close_connection = True
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
+    thread.start()
+    state.url = f"http://127.0.0.1:{server.server_address[1]}"
+    try:
+        yield state
+    finally:
+        state.gone.set()
+        server.shutdown()
+        server.server_close()
+        thread.join(10)
+
+
+def tiles(at: Misbehaving, **more: Any) -> Provider:
+    return Provider(at.url + "/tiles/{z}/{x}/{y}.png?key={token}", "xyz", SECRET, ("© Somebody",), **more)
+
+
+def fetched(known: Provider, resolution: float = 0.5) -> tuple[Picture, int]:
+    asked = sheet(known, BOX, resolution)
+    return put_together(asked, Fetcher(known, sleep=lambda _: None).fetch(asked.blocks), known.attribution, Limits())
+
+
+def check(picture: Picture) -> None:
+    """Every pixel shows the place that the transform says, and the box is covered with no more than a pixel around."""
+    height, width = picture.pixels.shape[:2]
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    at = placed(picture.transform, u.ravel(), v.ravel()).reshape(height, width, 2)
+    near = np.abs(at / 16 - np.round(at / 16)).min(axis=2) * 16 > 0.01  # not on the edge of a block of colour
+    assert near.mean() > 0.9
+    assert np.array_equal(picture.pixels[..., :3][near], world(at[..., 0], at[..., 1])[near])
+    (west, south), (east, north) = between(WGS84, online.MERCATOR, np.array([BOX[:2], BOX[2:]]))
+    size = picture.transform[0]
+    outline = picture.outline()
+    assert np.allclose(outline.min(axis=0), (west, south), atol=size)
+    assert np.allclose(outline.max(axis=0), (east, north), atol=size)
+
+
+@pytest.mark.parametrize("kind", ["xyz", "wms", "mapbox"])
+def test_what_is_fetched_lies_where_it_is_said_to_lie(provider: Misbehaving, kind: Any) -> None:
+    url = {"xyz": "/tiles/{z}/{x}/{y}.png", "wms": "/wms?layers=ortho&format=image/png", "mapbox": "/styles/static"}
+    known = Provider(provider.url + url[kind], kind, SECRET)
+    picture, missing = fetched(known)
+    check(picture)
+    assert (picture.crs, missing) == ("EPSG:3857", 0)
+    ground = picture.transform[0] * np.cos(np.radians(53.2685))
+    assert 0.25 < ground <= 0.5001
+    if kind == "wms":
+        assert ground == pytest.approx(0.5, rel=1e-3)
+        assert all(SECRET not in path for path in provider.asked)
+    if kind == "mapbox":
+        assert all(f"access_token={SECRET}" in path for path in provider.asked)
+
+
+def test_large_pictures_come_in_parts(provider: Misbehaving) -> None:
+    for kind, url in (("wms", "/wms?layers=ortho"), ("mapbox", "/styles/static")):
+        provider.asked.clear()
+        picture, _ = fetched(Provider(provider.url + url, kind, max_zoom=22), resolution=0.03)  # type: ignore[arg-type]
+        check(picture)
+        assert len(provider.asked) >= 2
+
+
+def test_rows_from_below_and_wmts_names() -> None:
+    box, size = (-0.5251, 53.2682, -0.5250, 53.2683), 0.5
+    plain = sheet(Provider("https://a/{z}/{x}/{y}", "xyz"), box, size).blocks[0]
+    below = sheet(Provider("https://a/{z}/{x}/{-y}", "xyz"), box, size).blocks[0]
+    wmts = sheet(Provider("https://a/{TileMatrix}/{TileCol}/{TileRow}", "xyz"), box, size).blocks[0]
+    z, x, y = (int(v) for v in plain.url.removeprefix("https://a/").split("/"))
+    assert below.url == f"https://a/{z}/{x}/{2**z - 1 - y}"
+    assert wmts.url == plain.url
+    # The tile that OpenStreetMap's wiki gives for this place by another formula.
+    n = 2**z
+    lat = np.radians(53.2683)
+    assert x == int((-0.5251 + 180) / 360 * n)
+    assert y == int((1 - np.arcsinh(np.tan(lat)) / np.pi) / 2 * n)
+
+
+@pytest.mark.parametrize(
+    ("mood", "error", "says"),
+    [
+        ("forbidden", CannotDerive, r"refuses \(403\)"),
+        ("broken", Unavailable, "answers 503"),
+        ("html", CannotDerive, "sends 'text/html'"),
+        ("disguised", CannotDerive, "neither PNG nor JPEG"),
+        ("huge", CannotDerive, "FLEETMAP_IMAGERY_MAX_BYTES"),
+        ("endless", CannotDerive, "FLEETMAP_IMAGERY_MAX_BYTES"),
+        ("dripping", Unavailable, "within"),
+        ("silent", Unavailable, "in time"),
+        ("elsewhere", CannotDerive, "another host"),
+        ("circle", CannotDerive, "redirects more than"),
+        ("missing", CannotDerive, "no picture of this place"),
+        ("small", CannotDerive, "64 × 64 pixels instead of 256 × 256"),
+        ("torn", CannotDerive, "cannot be read"),
+        ("bomb", CannotDerive, "cannot be read"),
+    ],
+)
+def test_a_provider_that_misbehaves(provider: Misbehaving, mood: str, error: type[Exception], says: str) -> None:
+    provider.mood = mood
+    known = tiles(provider, max_bytes=2**20, seconds=1.5, tries=2)
+    begun = time.monotonic()
+    with pytest.raises(error, match=says) as caught:
+        fetched(known)
+    assert time.monotonic() - begun < 8.0
+    assert SECRET not in str(caught.value)
+    assert SECRET not in repr(caught.value.__cause__)
+    assert "169.254" not in str(caught.value)
+
+
+def test_nobody_there(provider: Misbehaving) -> None:
+    with pytest.raises(Unavailable, match="cannot be reached"):
+        fetched(Provider("http://127.0.0.1:9/{z}/{x}/{y}", "xyz", tries=1))
+
+
+def test_a_busy_provider_is_asked_again(provider: Misbehaving) -> None:
+    provider.mood = "busy"
+    picture, _ = fetched(tiles(provider, tries=4))
+    check(picture)
+    provider.mood, provider.asked[:] = "busy", []
+    waits: list[float] = []
+    known = tiles(provider, tries=4)
+    asked = sheet(known, BOX, 0.5)
+    Fetcher(known, sleep=waits.append).fetch(asked.blocks)
+    assert waits
+    assert max(waits) <= online.LONGEST_WAIT
+
+
+def test_a_redirect_on_the_host_is_followed(provider: Misbehaving) -> None:
+    provider.mood = "led"
+    picture, _ = fetched(tiles(provider))
+    check(picture)
+
+
+def test_parts_that_are_missing_are_transparent(provider: Misbehaving) -> None:
+    provider.mood = "patchy"
+    picture, missing = fetched(tiles(provider), resolution=0.2)
+    assert missing == 1
+    assert picture.pixels.shape[2] == 4
+    assert 0 < (picture.pixels[..., 3] == 0).mean() < 1
+
+
+def test_what_was_fetched_is_kept_for_a_while(provider: Misbehaving, tmp_path: Path) -> None:
+    known = tiles(provider, cache_dir=tmp_path / "c", cache_bytes=10**6)
+    first, _ = fetched(known)
+    count = len(provider.asked)
+    provider.mood = "broken"
+    again, _ = fetched(known)
+    assert len(provider.asked) == count
+    assert np.array_equal(first.pixels, again.pixels)
+    files = list((tmp_path / "c").iterdir())
+    assert files
+    assert all(SECRET not in f.name and SECRET.encode() not in f.read_bytes() for f in files)
+    provider.mood = "fine"
+    size = max(f.stat().st_size for f in files)
+    fetched(tiles(provider, cache_dir=tmp_path / "c", cache_bytes=3 * size), resolution=0.1)
+    assert sum(f.stat().st_size for f in (tmp_path / "c").iterdir()) <= 3 * size
+
+
+@pytest.mark.parametrize(
+    ("box", "resolution", "says"),
+    [
+        ((-0.6, 53.0, -0.4, 53.2), 0.1, "coarser resolution"),
+        ((179.9, 0.0, 180.1, 0.1), 1.0, "date line"),
+        ((0.0, 86.0, 0.1, 86.1), 1.0, "pole"),
+    ],
+)
+def test_what_is_not_even_asked_for(box: Any, resolution: float, says: str) -> None:
+    with pytest.raises(Invalid, match=says):
+        sheet(Provider("https://a/{z}/{x}/{y}", "xyz"), box, resolution)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"imagery_url": "ftp://a/{z}/{x}/{y}"},
+        {"imagery_url": "https://a/tiles"},
+        {"imagery_url": "https://{z}/{x}/{y}"},
+        {"imagery_url": "https://a/wms?styles=", "imagery_kind": "wms"},
+    ],
+)
+def test_addresses_that_cannot_be(tmp_path: Path, values: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="imagery_url"):
+        settings_for(tmp_path, **values)
+
+
+# --- through the server ----------------------------------------------------------------------------------------------
+@contextmanager
+def serving(folder: Path, at: Misbehaving) -> Iterator[Api]:
+    more = {
+        "imagery_url": at.url + "/tiles/{z}/{x}/{y}.png?key={token}",
+        "imagery_token": SECRET,
+        "imagery_attribution": "© Somebody; © Else",
+        "imagery_tries": 1,
+        "imagery_cache_bytes": 0,
+    }
+    with running(settings_for(folder, **more)) as api:
+        yield api
+
+
+def test_a_site_gets_its_picture(provider: Misbehaving, tmp_path: Path) -> None:
+    with serving(tmp_path, provider) as api:
+        listed = {d["id"] for d in api.get("derivations").json()}
+        assert "location_to_imagery" in listed
+        api.post("environments", {"name": "farm", "datum": {"latitude": 53.2682, "longitude": -0.5251}})
+        wish = {"method": "location_to_imagery", "parameters": {"resolution": 0.5}}
+        path = "environments/farm/derivations"
+        no_fence = api.problem("POST", path, 422, json=wish)
+        assert "radius" in no_fence["detail"]
+        api.upload("farm", {"fence.kml": FENCE.encode()}, layer="location")
+        made = api.post(path, wish).json()
+        assert made["information"]["imagery"] == "derived"
+        assert made["stale"] == []
+        told = api.get(
+            "environments/farm/versions/latest/layers/imagery", headers={"Accept": "application/json"}
+        ).json()
+        assert told["crs"] == "EPSG:3857"
+        assert told["attribution"] == ["© Somebody", "© Else"]
+        report = api.get("environments/farm/versions/latest/reports/satellite").json()
+        assert report["attribution"] == ["© Somebody", "© Else"]
+        (line,) = [line for line in report["layers"] if line["layer"] == "imagery"]
+        assert line["steps"][0]["step"] == "location_to_imagery"
+        assert line["steps"][0]["parameters"]["provider"] == provider.url.removeprefix("http://")
+        assert SECRET not in str(report) + str(made) + str(told)
+        assert api.get("/maps/farm/satellite").content[:4] in (b"II*\0", b"MM\0*")
+        assert api.post(path, wish, expect=200).json()["version"] == made["version"], "the same picture"
+        # The fence moves: the picture stays, and stays served.
+        api.upload("farm", {"fence.kml": FENCE.replace("-0.5240", "-0.5242").encode()}, layer="location")
+        assert api.get("/maps/farm/satellite").status_code == 200
+        # What a provider does wrong makes no version.
+        for mood, status in (("broken", 503), ("html", 422), ("forbidden", 422), ("bomb", 422)):
+            provider.mood = mood
+            problem = api.problem("POST", path, status, json=wish)
+            assert SECRET not in str(problem)
+        before = api.get("environments/farm/versions/latest").json()["version"]
+        provider.mood = "fine"
+        api.problem("POST", path, 422, json={**wish, "parameters": {"zoom": 3}})
+        viewer = api.token_for("viewer")
+        viewer.problem("POST", path, 403, json=wish)
+        assert api.get("environments/farm/versions/latest").json()["version"] == before
+
+
+def test_without_a_provider_nobody_is_asked(api: Api, fresh: Callable[[], str]) -> None:
+    name = fresh()
+    api.post("environments", {"name": name, "datum": {"latitude": 53.2682, "longitude": -0.5251}})
+    wish = {"method": "location_to_imagery", "parameters": {"radius": 50}}
+    problem = api.problem("POST", f"environments/{name}/derivations", 422, json=wish)
+    assert "FLEETMAP_IMAGERY_URL" in problem["detail"]
+    assert "location_to_imagery" not in {d["id"] for d in api.get("derivations").json()}
