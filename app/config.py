@@ -135,6 +135,11 @@ class Settings(BaseSettings):
         default=64 * 2**20, ge=1024, description="Largest file that is answered over Zenoh; HTTP has no such bound."
     )
 
+    models_dir: Path | None = Field(
+        default=None,
+        description="Folder of segmentation models for pictures: `NAME.onnx`, with its classes in `NAME.json`. Unset: "
+        "none.",
+    )
     imagery_url: str | None = Field(
         default=None,
         description="Provider of satellite pictures for `location_to_imagery`; only its host is asked. Tiles: an "
@@ -205,7 +210,14 @@ class Settings(BaseSettings):
     max_warnings: int = Field(default=_DEFAULTS.warnings, ge=1, description="Most warnings kept with one version.")
 
     @field_validator(
-        "database_url", "blob_url", "admin_token", "zenoh_config", "imagery_url", "imagery_token", mode="before"
+        "database_url",
+        "blob_url",
+        "admin_token",
+        "zenoh_config",
+        "imagery_url",
+        "imagery_token",
+        "models_dir",
+        mode="before",
     )
     @classmethod
     def _empty_is_unset(cls, value: Any) -> Any:

@@ -212,6 +212,8 @@ def open_services(settings: Settings) -> Services:
             if not settings.insecure_no_auth:
                 _first_token(store, settings)
             intake = Intake(settings.spool_dir, settings.limits, at_once=settings.max_uploads)
+        if settings.models_dir is not None:
+            os.environ["FLEETMAP_MODELS_DIR"] = str(settings.models_dir.resolve())  # where derivations look for it
         pool = Pool(
             settings.conversion_workers,
             memory_bytes=settings.max_memory_bytes,

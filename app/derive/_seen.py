@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-from app.derive import Notes, _plans
+from app.derive import Notes, _model, _plans
 from app.derive._pictures import Ground, infrared
 from app.derive._segments import OWN, Segmentation, Segments, segments
 from app.errors import Invalid, Problem
@@ -39,6 +39,11 @@ def method_of(picture: Picture, how: Segmentation) -> str:
 
 def seen(on: Ground, picture: Picture, how: Segmentation, method: str, notes: Notes, name: str) -> Segments:
     """A picture told apart."""
+    if method == "model":
+        if not how.model:
+            raise Invalid("model: name one", [Problem("segmentation=model needs the name of a model", where="model")])
+        least = 1.0 if how.minimum_area is None else how.minimum_area
+        return _model.segments(on, _model.load(how.model), how.confidence, least, notes, name)
     nir = infrared(picture, how.near_infrared, name) if method == "index" else None
     return segments(on, how, method, nir, notes, name)
 

@@ -69,10 +69,11 @@ SAMPLE = 2**16
 class Segmentation:
     """How a picture is told apart."""
 
-    segmentation: Literal["auto", "colour", "index", "plan"] = parameter(
+    segmentation: Literal["auto", "colour", "index", "plan", "model"] = parameter(
         "auto",
         "colour: groups of like colour, then shape; index: vegetation by excess green, or NDVI with a near-infrared "
-        "band; plan: dark walls on bright paper; auto: plan for what looks like one, else colour",
+        "band; plan: dark walls on bright paper; model: what the model named by model= finds; auto: plan for what "
+        "looks like one, else colour",
     )
     picture: str | None = parameter(None, "which picture; default: satellite, else the only one of a level")
     resolution: float | None = parameter(
@@ -82,6 +83,8 @@ class Segmentation:
         maximum=100.0,
         unit="m",
     )
+    model: str | None = parameter(None, "model: name of the operator's model, of the YOLO family, in ONNX")
+    confidence: float = parameter(0.25, "model: what it is less sure of is left out", minimum=0.01, maximum=1.0)
     clusters: int = parameter(8, "colour: how many groups of like colour", minimum=2, maximum=32)
     cluster_seed: int = parameter(0, "colour: another number starts with other groups", minimum=0, maximum=2**31 - 1)
     near_infrared: int | None = parameter(
@@ -97,6 +100,8 @@ class Segmentation:
 
 
 OWN = {
+    "model": ("model",),
+    "confidence": ("model",),
     "clusters": ("colour",),
     "cluster_seed": ("colour",),
     "near_infrared": ("index",),
