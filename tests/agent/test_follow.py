@@ -10,6 +10,7 @@ from pathlib import Path
 from tests.agent.conftest import Gate, Robot, Start, network, whole
 from tests.api import samples
 from tests.api.conftest import Api
+from tests.events.conftest import eventually
 
 
 def test_the_first_sync(api: Api, place: str, robot: Start) -> None:
@@ -205,9 +206,12 @@ def test_two_robots_hold_the_same_root(api: Api, place: str, robot: Start) -> No
     assert len({json.dumps(one.standing["files"]) + one.standing["root"] for one in robots}) == 1
     told = api.get(f"robots?environment={place}").json()
     assert {r["robot"] for r in told} == {"robot-1", "robot-2"}
-    latest = api.get(f"environments/{place}/channels").json()[0]
-    assert latest["robots"]["holding"] == latest["robots"]["total"] == latest["robots"]["online"] == 2
-    assert latest["robots"]["since"]
+
+    def agree() -> bool:
+        told = api.get(f"environments/{place}/channels").json()[0]["robots"]
+        return bool(told["holding"] == told["total"] == told["online"] == 2 and told["since"])
+
+    eventually(agree)
     for one in robots:
         assert one.stop() == 0
 
