@@ -24,6 +24,7 @@ from starlette.exceptions import HTTPException
 
 from app import __version__
 from app.api import (
+    alignments,
     changes,
     channels,
     convert,
@@ -131,6 +132,7 @@ def create_app(settings: Settings) -> Server:
         transform,
         formats,
         derivations,
+        alignments,
         convert,
         events,
         manifest,

@@ -231,6 +231,52 @@ class RolloutBody(In):
     window: float = Field(600.0, ge=1, le=604_800, description="Seconds for which robots are watched after the move.")
 
 
+class OntoBody(In):
+    """The map that a grid is laid onto."""
+
+    layer: Literal["occupancy", "objects", "voxels"] = Field(
+        "occupancy", description="A stored grid, or a layer that a grid is derived from."
+    )
+    level: str = Field("ground", max_length=256)
+    name: str = Field("map", max_length=256, description="Of a stored grid.")
+    parameters: dict[str, Any] = Field(
+        default_factory=dict, description="Of the derivation, where there is one: `height`, `world` …"
+    )
+
+
+Place = tuple[float, float]
+
+
+class AlignmentBody(In):
+    """A stored grid that does not lie where it should, and what says where that is: another map, or pairs of points."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={
+            "examples": [{"pairs": [[[0, 0], [1, 2]], [[10, 0], [11, 2]]], "dry_run": True}],
+        },
+    )
+
+    grid: str = Field("map", max_length=256, description="The name of the grid that is moved.")
+    level: str = Field("ground", max_length=256)
+    onto: OntoBody | None = Field(None, description="The map that it shall lie on.")
+    pairs: list[tuple[Place, Place]] | None = Field(
+        None,
+        min_length=2,
+        max_length=1000,
+        description="Points [[x, y], [x, y]]: where it is, and where it should be, m.",
+    )
+    angle: float = Field(180.0, ge=0, le=180, description="The largest turn that is tried, degrees.")
+    reach: float | None = Field(None, ge=0, le=1e7, description="The farthest that the grid's middle may go, m.")
+    near: float | None = Field(
+        None, gt=0, le=1000, description="What agrees: cells this near to each other (0.1 m), or points (0.5 m)."
+    )
+    least: float = Field(0.5, ge=0, le=1, description="The share that has to agree.")
+    dry_run: bool = Field(False, description="Only tell what was found.")
+    message: str = Field("", max_length=MAX_TEXT)
+
+
 class ChannelBody(In):
     """Where a channel is to stand, and since when."""
 
@@ -405,6 +451,16 @@ class VersionOut(BaseModel):
     stale: list[dict[str, Any]] = Field(
         description="Derived parts whose inputs have changed since, with what has: maps are made from them anew."
     )
+
+
+class AlignmentOut(BaseModel):
+    """A motion p -> R(yaw) p + (x, y) in metres and radians, how well it fits, and the version in which it was made."""
+
+    alignment: dict[str, Any] | None = Field(
+        description="`x`, `y`, `yaw`, `residual` (m), `agreement` and `overlap` (shares), `origin` and `before`."
+    )
+    version: VersionOut | None
+    warnings: list[ProblemItem]
 
 
 class LayerOut(BaseModel):

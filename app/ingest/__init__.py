@@ -3,8 +3,9 @@
 ``prepare`` runs in a worker process (it reads hostile bytes and computes); ``service`` commits what it found.
 """
 
+from app.ingest.alignment import Alignment
 from app.ingest.derivation import Wish
 from app.ingest.online import Provider
 from app.ingest.service import Ingest, Outcome, SpooledFile, Upload
 
-__all__ = ["Ingest", "Outcome", "Provider", "SpooledFile", "Upload", "Wish"]
+__all__ = ["Alignment", "Ingest", "Outcome", "Provider", "SpooledFile", "Upload", "Wish"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from app.bundle import Hints
 from app.errors import CannotDerive, Conflict, Invalid, Problem, StaleParent, UnreadableFile
 from app.formats import Limits
 from app.ingest import online
+from app.ingest.alignment import Aligned, Alignment, prepare_alignment, told_before
 from app.ingest.derivation import Wish, prepare_derivation
 from app.ingest.derivation import check as check_wish
 from app.ingest.edits import edit_changes
@@ -230,6 +232,40 @@ class Ingest:
                     raise
         raise StaleParent(f"{environment} changes faster than a picture can be fetched: try again")
 
+    def align(
+        self,
+        environment: str,
+        wish: Alignment,
+        *,
+        message: str,
+        author: str,
+        if_match: str | None = None,
+        idempotency: str | None = None,
+    ) -> Outcome:
+        """A grid laid onto another map -> one version, or only what was found. body: {alignment, version, warnings}.
+
+        Raises NotFound, Invalid, CannotConvert (nothing fits), StaleParent.
+        """
+        key = _idempotency(idempotency, _digest(["align", dataclasses.asdict(wish), message]))
+        replayed = None if wish.dry_run else self._replayed(environment, key)
+        if replayed is not None and replayed.version is not None:
+            told = told_before(replayed.version, wish)
+            return dataclasses.replace(replayed, body=_aligned(told, replayed.version, replayed.version.warnings))
+        for last in _tries(if_match):
+            base = self._store.version(environment)
+            check_if_match(if_match, base)
+            found: Aligned = self._in_worker(prepare_alignment, base, wish, what="the grid could not be aligned")
+            if found.prepared is None:
+                return Outcome("dry_run", None, _aligned(found.told, None, found.warnings))
+            try:
+                text = message or f"Aligned the grid {wish.level}/{wish.grid}"
+                made = self._commit(environment, base, found.prepared, author, text, (), found.warnings, key)
+                return dataclasses.replace(made, body=_aligned(found.told, made.version, found.warnings))
+            except StaleParent:
+                if last:
+                    raise
+        raise StaleParent(f"{environment} changes faster than a grid can be aligned: try again")
+
     def revert(
         self,
         environment: str,
@@ -366,6 +402,11 @@ class Ingest:
             parts=p.parts,
         )
         return {**preview.as_dict(), "version": None, "time": None}
+
+
+def _aligned(told: Mapping[str, Any] | None, version: Version | None, warnings: Sequence[Problem]) -> dict[str, Any]:
+    made = None if version is None else version.as_dict()
+    return {"alignment": told, "version": made, "warnings": [w.as_dict() for w in warnings]}
 
 
 def check_if_match(header: str | None, head: Version) -> None:

@@ -54,7 +54,7 @@ def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
         f"{e}/channels": "get", f"{e}/channels/{{channel}}": "put",
         f"{e}/channels/{{channel}}/planned": "delete", f"{e}/transform": "get", "/api/v1/convert": "post",
         "/api/v1/derivations": "get", "/api/v1/events": "get", f"{v}/provenance": "get",
-        "/api/v1/keys": "get post", f"{v}/manifest": "get", f"{e}/derivations": "post",
+        "/api/v1/keys": "get post", f"{v}/manifest": "get", f"{e}/derivations": "post", f"{e}/alignments": "post",
         "/api/v1/robots": "get", "/api/v1/robots/{robot}": "get delete", "/api/v1/robots/{robot}/status": "put",
         "/api/v1/jobs/{id}": "get delete", "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete",
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from app.derive.objects_to_voxels import Parameters as VoxelParameters
 from app.derive.objects_to_voxels import objects_to_voxels
 from app.errors import Invalid
 from app.formats import Limits
+from app.model.alignment import Fit, of_grids
 from app.model.features import features
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
@@ -159,3 +161,37 @@ def test_of_several_worlds_one_is_cut(shared: Path) -> None:
     building = features([("a", shapely.box(0, 0, 1, 1), {"kind": "building"})], "local")
     with pytest.raises(Invalid, match="no world is stored"):
         sliced(Layers({PartKey("objects", "ground", "x"): building}), world="moon")
+
+
+def of_the_robot(folder: Path) -> OccupancyGrid:
+    files = {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix in (".yaml", ".pgm", ".png")}
+    (grid,) = read(files).grids().values()
+    return grid
+
+
+@pytest.mark.parametrize(
+    ("pair", "maps", "shift", "degrees"),
+    [
+        ("turtlebot3_world", "gazebo_sdf/turtlebot3_world/maps", (0.05, 0.0), 0.2),
+        ("aws_small_warehouse", "gazebo_sdf/aws_small_warehouse/maps/005", (-0.10, -0.15), 0.2),
+        # Recorded by a robot: what fits best is turned by 0.8 degrees, whichever turn it is found from.
+        ("turtlebot3_world", "occupancy_grid/nav2_tb3_sandbox", (0.05, 0.0), 1.0),
+    ],
+)
+def test_a_robots_map_is_laid_onto_its_world(
+    shared: Path, pair: str, maps: str, shift: tuple[float, float], degrees: float
+) -> None:
+    """The known shifts (a map's places less the world's) are found again to a cell, and from any turn."""
+    data = shared / "data"
+    onto = sliced(world(data, pair), height=known(data, pair)["slice_z_m"])
+    grid = of_the_robot(data / maps)
+    for out in (Fit(0, 0, 0, 0, 1), Fit(3.0, -2.0, math.radians(-64), 0, 1)):
+        moving = out.moved(grid)
+        fit = of_grids(moving, onto)[0]
+        back = fit.moved(moving)
+        middle = middles(onto).mean(axis=0)[None]
+        gone = Fit(0, 0, back.origin[2], 0, 1).of(middle - grid.origin[:2]) + back.origin[:2] - middle
+        assert np.abs(gone + shift).max() < 0.05 + 1e-9
+        assert abs(math.degrees(back.origin[2])) < degrees
+        assert fit.agreement > 0.95
+        assert fit.residual < 0.05

@@ -1,0 +1,66 @@
+"""Grids laid onto other maps: where they should lie, told or committed."""
+
+from __future__ import annotations
+
+import math
+
+from fastapi import APIRouter
+from starlette.responses import Response
+
+from app.api.access import Editor
+from app.api.answers import Route, answer
+from app.api.schemas import AlignmentBody, AlignmentOut, EnvironmentPath, IdempotencyKey, IfMatch, OntoBody, told
+from app.api.services import Here
+from app.errors import Invalid, Problem
+from app.ingest import Alignment
+
+router = APIRouter(tags=["alignments"], route_class=Route)
+
+
+@router.post(
+    "/environments/{env}/alignments",
+    status_code=201,
+    responses={
+        **told(AlignmentOut, 400, 404, 409, 412, 415, 422, 503, ok=201, description="A new version"),
+        200: {"model": AlignmentOut, "description": "A dry run, or nothing changed."},
+    },
+    summary="Lay a grid onto another map",
+)
+def create_alignment(
+    env: EnvironmentPath,
+    body: AlignmentBody,
+    here: Here,
+    who: Editor,
+    if_match: IfMatch = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """Find the turn and the shift that lay a stored grid onto another grid, a slice of the objects, or given points.
+
+    The grid's origin changes, its cells do not; `normalize=true` of `occupancy_grid` bakes a turn into the cells.
+    """
+    if (body.onto is None) == (body.pairs is None):
+        reason = "give either onto or pairs"
+        raise Invalid(reason, [Problem(reason, where="body.onto")])
+    onto = body.onto or OntoBody.model_validate({})
+    wish = Alignment(
+        grid=body.grid,
+        level=body.level,
+        layer=onto.layer,
+        name=onto.name,
+        onto_level=onto.level,
+        values=onto.parameters,
+        pairs=tuple(body.pairs or ()),
+        angle=math.radians(body.angle),
+        reach=body.reach,
+        near=body.near or (0.5 if body.pairs else 0.1),
+        least=body.least,
+        dry_run=body.dry_run,
+    )
+    outcome = here.ingest.align(
+        env, wish, message=body.message, author=who.name, if_match=if_match, idempotency=idempotency_key
+    )
+    version = outcome.version
+    if version is None or outcome.status == "unchanged":
+        return answer(outcome.body)
+    headers = {"etag": f'"{version.number}"', "fleetmap-version": str(version.number), "fleetmap-root": version.root}
+    return answer(outcome.body, 201, headers)

@@ -1,0 +1,148 @@
+"""A grid laid onto another map of the site: a version in which it lies elsewhere, its cells untouched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from app import derive
+from app.derive import Notes
+from app.errors import CannotConvert, Invalid, NotFound, Problem
+from app.ingest.prepare import open_store
+from app.model import alignment
+from app.model.frame import GROUND
+from app.model.grid import OccupancyGrid
+from app.model.layers import MAP, Layers, PartKey
+from app.store.changes import Changes, Prepared, Replace
+from app.store.values import Version
+
+ALIGNED = "aligned"
+"""The step in a part's provenance that tells of it."""
+
+WAYS: Mapping[str, str] = {"objects": "objects_to_occupancy", "voxels": "voxels_to_occupancy"}
+"""The derivation by which a layer is looked at as a grid."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """What is to be laid onto what. pairs: points (from, to) in metres, instead of a map. values: parameters of the
+    derivation that makes a grid of the layer. angle: radians. least: the share that has to agree."""
+
+    grid: str = MAP
+    level: str = GROUND
+    layer: Literal["occupancy", "objects", "voxels"] = "occupancy"
+    name: str = MAP
+    onto_level: str = GROUND
+    values: Mapping[str, Any] = field(default_factory=dict)
+    pairs: tuple[tuple[tuple[float, float], tuple[float, float]], ...] = ()
+    angle: float = math.pi
+    reach: float | None = None
+    near: float = 0.1
+    least: float = 0.5
+    dry_run: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Aligned:
+    """What was found. prepared: None where it is only told."""
+
+    told: dict[str, Any]
+    warnings: tuple[Problem, ...]
+    prepared: Prepared | None
+
+
+def prepare_alignment(database_url: str, blob_dir: str, base: Version, wish: Alignment) -> Aligned:
+    """In a worker: find where the grid lies, and put it there unless that is only to be told.
+
+    Raises NotFound (no such grid), Invalid (parameters), CannotConvert (nothing fits well enough).
+    """
+    store = open_store(database_url, blob_dir)
+    key = PartKey("occupancy", wish.level, wish.grid)
+    target = PartKey("occupancy", wish.onto_level, wish.name)
+    entries = {e.key: e for e in base.parts}
+    if key not in entries:
+        grids = ", ".join(f"{k.level}/{k.name}" for k in sorted(entries) if k.layer == "occupancy") or "none"
+        raise NotFound(f"there is no grid {wish.level}/{wish.grid}; stored grids: {grids}")
+    if not wish.pairs and wish.layer == "occupancy" and key == target:
+        reason = "a grid lies on itself already: name another one, a layer (objects, voxels), or pairs of points"
+        raise Invalid(reason, [Problem(reason, where="body.onto")])
+    if wish.layer != "occupancy" and not wish.pairs:
+        wanted = [k for k in entries if k.layer in (wish.layer, "resources", "location")]
+    else:
+        wanted = [] if wish.pairs else [target]
+    loaded = store.load(base, sorted({key, *wanted}))
+    grid = loaded.parts[key]
+    assert isinstance(grid, OccupancyGrid)
+    notes = Notes()
+    if wish.pairs:
+        fit, told = _by_points(wish, notes)
+    else:
+        known = loaded.parts.get(target) if wish.layer == "occupancy" else _seen(loaded, wish, target, notes)
+        assert isinstance(known, OccupancyGrid)
+        fits = alignment.of_grids(grid, known, angle=wish.angle, reach=wish.reach, near=wish.near)
+        fit, told = fits[0], {"others": [f.as_dict() for f in fits[1:4]]}
+        if len(fits) > 1 and fits[1].score >= fit.score - 0.05:
+            notes.warn("another place fits about as well (see others): the site has a symmetry; give a smaller angle")
+    moved = fit.moved(grid)
+    told = {
+        "grid": {"level": wish.level, "name": wish.grid},
+        **fit.as_dict(),
+        "origin": list(moved.origin),
+        "before": list(grid.origin),
+        **told,
+    }
+    if fit.score < wish.least:
+        reason = (
+            f"the maps do not fit: at the best place {fit.score:.0%} agree within {wish.near:g} m, "
+            f"and {wish.least:.0%} are asked for (least)"
+        )
+        if not wish.dry_run:
+            raise CannotConvert(f"{reason}; give pairs of points, a larger near, or look at it with dry_run", [])
+        notes.warn(reason)
+    if any(k.layer in ("topology", "zones", "imagery") or (k.layer == "occupancy" and k != key) for k in entries):
+        notes.warn("other layers keep their place: what was drawn on the grid in local metres does not move with it")
+    if wish.dry_run:
+        return Aligned(told, tuple(notes.warnings), None)
+    old = entries[key].provenance.marked()
+    provenance = replace(old, steps=(*old.steps, {"step": ALIGNED, "parameters": told}))
+    prepared = store.prepare(base, Changes((Replace(key, moved, provenance),)))
+    return Aligned(told, tuple(notes.warnings), prepared)
+
+
+def told_before(version: Version, wish: Alignment) -> dict[str, Any] | None:
+    """What a version's provenance says of such an alignment, for a request that is sent again."""
+    for entry in version.parts:
+        if entry.key == PartKey("occupancy", wish.level, wish.grid):
+            steps = [s for s in entry.provenance.steps if s.get("step") == ALIGNED]
+            return dict(steps[-1]["parameters"]) if steps else None
+    return None
+
+
+def _by_points(wish: Alignment, notes: Notes) -> tuple[alignment.Fit, dict[str, Any]]:
+    fit, disagreeing, scale = alignment.of_pairs(np.array(wish.pairs, np.float64).reshape(-1, 2, 2), near=wish.near)
+    if disagreeing:
+        notes.warn(f"{len(disagreeing)} pairs disagree with the others and were not used: {disagreeing[:20]}")
+    if abs(scale - 1.0) > 0.02:
+        notes.warn(f"the second points are {scale:.3f} times as far apart: is the grid's resolution right?")
+    return fit, {"disagreeing": disagreeing, "scale": round(scale, 6)}
+
+
+def _seen(loaded: Layers, wish: Alignment, target: PartKey, notes: Notes) -> OccupancyGrid:
+    """The layer as the grid that a derivation makes of it."""
+    step = derive.all_derivations()[WAYS[wish.layer]].step()
+    unknown = wish.values.keys() - derive.takes(step.name)
+    if unknown:
+        accepted = ", ".join(sorted(derive.takes(step.name)))
+        reason = f"no such parameter of {step.name}; accepted: {accepted}"
+        raise Invalid(reason, [Problem(reason, where=f"body.onto.parameters.{name}") for name in sorted(unknown)])
+    bare = Layers({k: p for k, p in loaded.parts.items() if k.layer != "occupancy"}, loaded.datum, loaded.levels)
+    made = derive.run(derive.with_values([step], wish.values), bare, notes)
+    found = made.parts.get(PartKey("occupancy", target.level, MAP))
+    if not isinstance(found, OccupancyGrid):
+        levels = ", ".join(k.level for k in made.grids())
+        raise NotFound(f"{step.name} makes no grid of the level {target.level}; it makes: {levels}")
+    return found

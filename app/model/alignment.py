@@ -1,0 +1,364 @@
+"""How one map lies on another: a turn and a shift in the plane, told with how well it fits.
+
+Two ways. Grids: the outlines of what is occupied in one are laid on those of the other at every angle, all shifts of an
+angle at once by a correlation in the frequency domain (Lewis, Fast Normalized Cross-Correlation, 1995, without the
+norm); the best places are refined by iterative closest points (Besl and McKay 1992), each step the least-squares rigid
+motion (Umeyama 1991, without scale). Points: pairs that people give, the largest set of pairs that agree, by the same
+least squares.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.errors import CannotConvert, Invalid, Problem
+from app.model.frame import MAX_METRES
+from app.model.grid import OCCUPIED, OccupancyGrid
+
+Array = NDArray[np.float64]
+
+SIDE = 128
+"""Cells along the longer side of a map in the search over all angles."""
+
+PLACES = 16
+"""Places that are refined."""
+
+POINTS = 1500
+"""Cells of a map that take part in a refinement; of more, some evenly."""
+
+MOST_PAIRS = 1000
+"""Pairs of points."""
+
+_CLOSE = 0.02
+"""Of two places whose cells agree by less than this share more or less, the nearer one is taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A motion of one map onto another: p -> R(yaw) p + (x, y), metres and radians in the local frame.
+
+    residual: the root mean square distance in metres of what agrees. agreement: the share of the moved map's occupied
+    cells within the other one's outline (or of the pairs) that agree. overlap: the share that lies there at all.
+    """
+
+    x: float
+    y: float
+    yaw: float
+    residual: float
+    agreement: float
+    overlap: float = 1.0
+
+    @property
+    def score(self) -> float:
+        """The share of all that agrees."""
+        return self.agreement * self.overlap
+
+    def of(self, points: Array) -> Array:
+        """Points [n, 2] after the motion."""
+        return np.asarray(points @ _turn(self.yaw).T + np.array([self.x, self.y]), np.float64)
+
+    def moved(self, grid: OccupancyGrid) -> OccupancyGrid:
+        """The grid at its new place; its cells stay as they are."""
+        x, y, yaw = grid.origin
+        new = self.of(np.array([[x, y]]))[0]
+        return replace(grid, origin=(round(float(new[0]), 9), round(float(new[1]), 9), _angle(yaw + self.yaw)))
+
+    def as_dict(self) -> dict[str, float]:
+        """The motion and its quality: metres, radians, shares."""
+        return {
+            "x": round(self.x, 6),
+            "y": round(self.y, 6),
+            "yaw": round(self.yaw, 9),
+            "residual": round(self.residual, 6),
+            "agreement": round(self.agreement, 6),
+            "overlap": round(self.overlap, 6),
+        }
+
+
+def of_grids(
+    moving: OccupancyGrid, onto: OccupancyGrid, *, angle: float = math.pi, reach: float | None = None, near: float = 0.1
+) -> list[Fit]:
+    """The places where one grid's obstacles lie on another's, the best first; places that are much alike are one.
+
+    angle: the largest turn, radians. reach: the farthest that the moving grid's middle may go, metres. near: cells this
+    near to each other agree, metres; at least a cell of the coarser grid counts as near. Raises CannotConvert where a
+    grid shows nothing.
+    """
+    near = max(near, moving.resolution, onto.resolution)
+    own, theirs = _outline(moving), _outline(onto)
+    for points, which in ((own, "that is moved"), (theirs, "that it is moved onto")):
+        if len(points) < 3:
+            raise CannotConvert(f"the grid {which} has {len(points)} occupied cells at borders: nothing to align by")
+    middle = own.mean(axis=0)
+    search = _Search(own - middle, theirs, near)
+    limit = math.inf if reach is None else reach
+    found: list[Fit] = []
+    from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+
+    tree, judge = cKDTree(theirs), cKDTree(_all(onto))
+    every = _some(_all(moving), 20_000)
+    here = _some(own)
+    for yaw, shift in search.places(angle, limit, middle):
+        at = Fit(*_carried(shift, yaw, middle), yaw, 0.0, 0.0)
+        refined = _refined(at, here, tree, 3 * search.cell, near)
+        gone = float(np.linalg.norm(refined.of(middle[None])[0] - middle))
+        if abs(refined.yaw) <= angle + 1e-3 and gone <= limit + near:
+            found.append(_judged(refined, every, judge, onto, near))
+    found = _distinct(sorted(found, key=lambda f: (-f.score, abs(f.yaw))), middle, near)
+    if not found:
+        raise CannotConvert("the maps meet nowhere within this angle and reach")
+    # Of places that fit as well as the best, the one that moves the map least: sites have symmetries.
+    rivals = [f for f in found if f.score >= found[0].score - _CLOSE]
+    first = min(rivals, key=lambda f: float(np.linalg.norm(f.of(own) - own, axis=1).mean()))
+    polished = _polished(first, _some(own, 2 * POINTS), tree, middle, near)
+    return [_judged(polished, every, judge, onto, near), *(f for f in found if f is not first)]
+
+
+def of_pairs(pairs: Array, *, near: float = 0.5) -> tuple[Fit, list[int], float]:
+    """(the motion that brings the first points of pairs onto the second ones, which pairs disagree, their scale).
+
+    pairs: float64 [n, 2, 2], n ≥ 2: [from, to] in metres. near: how far apart, in metres, points that agree may be
+    afterwards. scale: how many times as far apart the second points are; a motion has none. Raises Invalid for
+    points that say nothing of a turn.
+    """
+    if pairs.ndim != 3 or pairs.shape[1:] != (2, 2) or not 2 <= len(pairs) <= MOST_PAIRS:
+        reason = f"from 2 to {MOST_PAIRS} pairs of points [[x, y], [x, y]] are needed"
+        raise Invalid(reason, [Problem(reason, where="pairs")])
+    if not np.isfinite(pairs).all() or (np.abs(pairs) > MAX_METRES).any():
+        reason = f"coordinates must be finite metres within ±{MAX_METRES:g}"
+        raise Invalid(reason, [Problem(reason, where="pairs")])
+    a, b = pairs[:, 0], pairs[:, 1]
+    if min(np.ptp(a, axis=0).max(), np.ptp(b, axis=0).max()) < 1e-6:
+        reason = "all points are in one place: a turn needs points apart"
+        raise Invalid(reason, [Problem(reason, where="pairs")])
+    best = np.ones(len(pairs), bool)
+    if len(pairs) > 2:
+        best = _largest(a, b, near)
+    yaw, shift = _rigid(a[best], b[best])
+    away = np.linalg.norm(a @ _turn(yaw).T + shift - b, axis=1)
+    spread = [float(np.linalg.norm(p[best] - p[best].mean(axis=0))) for p in (a, b)]
+    fit = Fit(float(shift[0]), float(shift[1]), yaw, float(np.sqrt((away[best] ** 2).mean())), float(best.mean()))
+    return fit, np.flatnonzero(~best).tolist(), spread[1] / spread[0] if spread[0] > 0 else 1.0
+
+
+def _largest(a: Array, b: Array, near: float) -> NDArray[np.bool_]:
+    """The most pairs that one motion brings together, of the motions that two of them say; at least two."""
+    count = len(a)
+    seeds: Iterable[tuple[int, int]] = combinations(range(count), 2)
+    if count > 64:  # RANSAC with a fixed seed: the same answer each time
+        chance = np.random.default_rng(0).integers(0, count, (4000, 2))
+        seeds = sorted({(min(i, j), max(i, j)) for i, j in chance.tolist() if i != j})
+    best, least = np.zeros(count, bool), math.inf
+    for i, j in seeds:
+        if np.linalg.norm(a[i] - a[j]) < 1e-6 or np.linalg.norm(b[i] - b[j]) < 1e-6:
+            continue
+        yaw, shift = _rigid(a[[i, j]], b[[i, j]])
+        away = np.linalg.norm(a @ _turn(yaw).T + shift - b, axis=1)
+        good = away <= near
+        error = float(away[good].sum())
+        if (-good.sum(), error) < (-best.sum(), least):
+            best, least = good, error
+    if best.sum() < 2:
+        reason = f"no two pairs agree within {near:g} m on one motion without a scale"
+        raise Invalid(reason, [Problem(reason, where="pairs")])
+    return best
+
+
+# --- the search over all angles --------------------------------------------------------------------------------------
+
+
+class _Search:
+    """Where points [n, 2] around 0 meet other points [m, 2], coarsely: cells of ``cell`` metres."""
+
+    def __init__(self, own: Array, theirs: Array, near: float) -> None:
+        import cv2
+
+        self.radius = float(np.linalg.norm(own, axis=1).max())
+        low, high = theirs.min(axis=0), theirs.max(axis=0)
+        self.cell = max(near, float(max((high - low).max(), 2 * self.radius)) / SIDE)
+        margin = self.radius + 2 * self.cell
+        self.low = low - margin
+        wanted = np.ceil((high - low + 2 * margin) / self.cell).astype(int) + 1
+        self.width, self.height = (cv2.getOptimalDFTSize(int(v)) for v in wanted)
+        there = np.full((self.height, self.width), 255, np.uint8)
+        column, row = ((theirs - self.low) / self.cell).astype(int).T
+        there[row, column] = 0
+        away = cv2.distanceTransform(there, cv2.DIST_L2, 5)
+        # A cell beside the outline counts half, and one that is two away next to nothing.
+        field = np.exp(-0.7 * away.astype(np.float64) ** 2)
+        self.field = np.fft.rfft2(field)
+        self.own = own
+
+    def places(self, angle: float, reach: float, middle: Array) -> list[tuple[float, Array]]:
+        """(yaw, where the middle goes) of the best places, apart from each other."""
+        step = min(math.radians(3.0), self.cell / max(self.radius, self.cell))
+        count = math.ceil(min(angle, math.pi) / step)
+        turns = np.linspace(-1, 1, 2 * count + 1) * min(angle, math.pi) if count else np.zeros(1)
+        allowed = self._allowed(reach, middle)
+        found: list[tuple[float, float, Array]] = []
+        for yaw in turns.tolist():
+            score = self._scores(yaw)
+            if allowed is not None:
+                score = np.where(allowed, score, 0.0)
+            for _ in range(3):
+                k = int(score.argmax())
+                row, column = divmod(k, self.width)
+                if score[row, column] <= 0:
+                    break
+                found.append((float(score[row, column]), yaw, self.low + (np.array([column, row]) + 0.5) * self.cell))
+                score[max(0, row - 3) : row + 4, max(0, column - 3) : column + 4] = 0.0
+        found.sort(key=lambda f: (-f[0], abs(f[1]), f[1]))
+        out: list[tuple[float, Array]] = []
+        for _, yaw, at in found:
+            twins = (abs(_angle(yaw - y)) < 2.5 * step and np.linalg.norm(at - a) < 4 * self.cell for y, a in out)
+            if not any(twins):
+                out.append((yaw, at))
+                if len(out) == PLACES:
+                    break
+        return out
+
+    def _scores(self, yaw: float) -> Array:
+        """For each cell, how much meets where the middle lies there."""
+        turned = np.floor(self.own @ _turn(yaw).T / self.cell + 0.5).astype(int)
+        image = np.zeros((self.height, self.width))
+        image[turned[:, 1] % self.height, turned[:, 0] % self.width] = 1.0
+        return np.asarray(np.fft.irfft2(self.field * np.fft.rfft2(image).conj(), s=image.shape))
+
+    def _allowed(self, reach: float, middle: Array) -> NDArray[np.bool_] | None:
+        if math.isinf(reach):
+            return None
+        x = self.low[0] + (np.arange(self.width) + 0.5) * self.cell - middle[0]
+        y = self.low[1] + (np.arange(self.height) + 0.5) * self.cell - middle[1]
+        return np.asarray(np.hypot(x[None, :], y[:, None]) <= reach + self.cell)
+
+
+# --- refinement ------------------------------------------------------------------------------------------------------
+
+
+def _refined(start: Fit, own: Array, tree: Any, wide: float, near: float) -> Fit:
+    """Closest points, from a wide search to a narrow one."""
+    yaw, shift = start.yaw, np.array([start.x, start.y])
+    for reach in (wide, wide / 2, 2 * near, near):
+        for _ in range(25):
+            placed = own @ _turn(yaw).T + shift
+            away, index = tree.query(placed, distance_upper_bound=max(reach, near))
+            good = np.isfinite(away)
+            if good.sum() < 3:
+                break
+            turn, move = _rigid(placed[good], tree.data[index[good]])
+            yaw, shift = yaw + turn, _turn(turn) @ shift + move
+            if abs(turn) < 1e-5 and float(np.abs(move).max()) < 1e-4:
+                break
+    return Fit(float(shift[0]), float(shift[1]), _angle(yaw), 0.0, 0.0)
+
+
+def _polished(fit: Fit, own: Array, tree: Any, middle: Array, near: float) -> Fit:
+    """The least distances both ways, cut off at ``near``: closest points rest a little before them, where round things
+    may turn or where cells lie on cells. By Nelder and Mead's simplex, from a few turns around the fit."""
+    from scipy.optimize import minimize  # type: ignore[import-untyped]
+    from scipy.spatial import cKDTree
+
+    theirs = _some(np.asarray(tree.data), 2 * POINTS)
+    centred = own - middle
+    known = cKDTree(centred)
+    size = float(np.sqrt((centred**2).sum(axis=1).mean()))  # a turn in metres, as far as it moves a usual point
+
+    def cost(v: Array) -> float:
+        turn, at = _turn(float(v[0]) / size), v[1:]
+        away, _ = tree.query(centred @ turn.T + at, distance_upper_bound=near)
+        back, _ = known.query((theirs - at) @ turn, distance_upper_bound=near)
+        return float((np.minimum(away, near) ** 2).mean() + (np.minimum(back, near) ** 2).mean())
+
+    def least(start: Array, step: float, tries: int) -> Any:
+        simplex = start + step * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        options = {"initial_simplex": simplex, "maxfev": tries, "xatol": near / 200, "fatol": 0.0}
+        return minimize(cost, start, method="Nelder-Mead", options=options)
+
+    start = np.array([fit.yaw * size, *fit.of(middle[None])[0]])
+    tried = [least(start + np.array([k * near / 2, 0.0, 0.0]), near / 2, 30) for k in (0, 1, -1, 2, -2, 3, -3)]
+    best = least(min(tried, key=lambda found: float(found.fun)).x, near / 8, 100).x
+    yaw = _angle(float(best[0]) / size)
+    return Fit(*_carried(best[1:], yaw, middle), yaw, 0.0, 0.0)
+
+
+def _judged(fit: Fit, every: Array, judge: Any, onto: OccupancyGrid, near: float) -> Fit:
+    """The fit with its quality. every: the moving grid's occupied cells."""
+    placed = fit.of(every)
+    x, y, yaw = onto.origin
+    inside = (placed - np.array([x, y])) @ _turn(yaw) / onto.resolution
+    margin = near / onto.resolution
+    covered = ((inside >= -margin) & (inside <= np.array([onto.width, onto.height]) + margin)).all(axis=1)
+    away, _ = judge.query(placed[covered], distance_upper_bound=near * (1 + 1e-9))
+    good = np.isfinite(away)
+    if not good.any():
+        return Fit(fit.x, fit.y, fit.yaw, math.inf, 0.0, float(covered.mean()))
+    residual = float(np.sqrt((away[good] ** 2).mean()))
+    return Fit(fit.x, fit.y, fit.yaw, residual, float(good.mean()), float(covered.mean()))
+
+
+def _distinct(fits: list[Fit], middle: Array, near: float) -> list[Fit]:
+    out: list[Fit] = []
+    for fit in fits:
+        here = fit.of(middle[None])[0]
+        if fit.score > 0 and not any(
+            abs(_angle(fit.yaw - o.yaw)) < 0.05 and np.linalg.norm(here - o.of(middle[None])[0]) < 4 * near for o in out
+        ):
+            out.append(fit)
+    return out
+
+
+def _rigid(a: Array, b: Array) -> tuple[float, Array]:
+    """(yaw, shift) with the least squares of R a + shift - b."""
+    low, high = a.mean(axis=0), b.mean(axis=0)
+    p, q = a - low, b - high
+    yaw = math.atan2(float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum()), float((p * q).sum()))
+    return yaw, high - _turn(yaw) @ low
+
+
+def _turn(yaw: float) -> Array:
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, -s], [s, c]])
+
+
+def _angle(yaw: float) -> float:
+    """The same angle within ±π, to 1e-12."""
+    return round(math.remainder(yaw, 2 * math.pi), 12)
+
+
+def _carried(at: Array, yaw: float, middle: Array) -> tuple[float, float]:
+    """The shift of a motion that turns by yaw and brings the middle to ``at``."""
+    x, y = (at - _turn(yaw) @ middle).tolist()
+    return x, y
+
+
+def _some(points: Array, most: int = POINTS) -> Array:
+    """At most so many of the points, evenly taken."""
+    return points if len(points) <= most else points[np.linspace(0, len(points) - 1, most).astype(int)]
+
+
+def _all(grid: OccupancyGrid) -> Array:
+    """The middles of occupied cells in metres, float64 [n, 2]."""
+    return _placed(grid, grid.cells == OCCUPIED)
+
+
+def _outline(grid: OccupancyGrid) -> Array:
+    """The middles of occupied cells beside others, in metres: what a laser sees of a wall, however thick."""
+    import cv2
+
+    solid = (grid.cells == OCCUPIED).astype(np.uint8)
+    inner = cv2.erode(solid, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return _placed(grid, (solid - inner).astype(bool))
+
+
+def _placed(grid: OccupancyGrid, chosen: NDArray[np.bool_]) -> Array:
+    row, column = np.nonzero(chosen)
+    x, y, yaw = grid.origin
+    cells = (np.column_stack([column, row]) + 0.5) * grid.resolution
+    return np.asarray(cells @ _turn(yaw).T + np.array([x, y]))
