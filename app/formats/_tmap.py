@@ -61,11 +61,13 @@ NUMERIC_WORDS = ("speed_limit", "width")
 
 ACTION, ACTION_TYPE = "move_base", "move_base_msgs/MoveBaseGoal"
 RADIUS = 0.75
-RING = [
-    {"x": round(RADIUS * math.cos(a), 12), "y": round(RADIUS * math.sin(a), 12)}
-    for a in (math.pi / 8 + k * math.pi / 4 for k in range(8))
-]
-"""The influence zone of a node that has none: a regular octagon around it, metres from the node."""
+
+
+def ring(radius: float) -> list[dict[str, float]]:
+    """The influence zone of a node that has none: a regular octagon around it, metres from the node."""
+    turns = (math.pi / 8 + k * math.pi / 4 for k in range(8))
+    return [{"x": round(radius * math.cos(a), 12), "y": round(radius * math.sin(a), 12)} for a in turns]
+
 
 EDGE_TEMPLATE: Mapping[str, Any] = {
     "config": [],
@@ -81,14 +83,13 @@ NODE_TEMPLATE: Mapping[str, Any] = {
     "parent_frame": "map",
     "restrictions_planning": "True",
     "restrictions_runtime": "True",
-    "verts": RING,
 }
 TOLERANCES = {"xy_goal_tolerance": 0.3, "yaw_goal_tolerance": 0.1}
 ANY_YAW = 6.29
 """Yaw tolerance of a node whose orientation is not known: any."""
 
 LIST_EDGE: Mapping[str, Any] = {"inflation_radius": 0.0, "recovery_behaviours_config": ""}
-LIST_NODE: Mapping[str, Any] = {"localise_by_topic": "", "verts": RING}
+LIST_NODE: Mapping[str, Any] = {"localise_by_topic": ""}
 """What the list's reader takes of each item, less what depends on the map; it looks at no other key."""
 
 TRANSFORMATION = {
@@ -107,6 +108,19 @@ class WriteOptions:
 
     action: str = parameter(ACTION, "action of edges that name none")
     action_type: str = parameter(ACTION_TYPE, "type of that action's goal")
+    verts_radius: float = parameter(
+        RADIUS, "of the octagon around nodes that have no verts", minimum=1e-3, maximum=1000.0, unit="m"
+    )
+    xy_goal_tolerance: float = parameter(
+        TOLERANCES["xy_goal_tolerance"], "of nodes that have none", minimum=0.0, maximum=1000.0, unit="m"
+    )
+    yaw_goal_tolerance: float = parameter(
+        TOLERANCES["yaw_goal_tolerance"],
+        f"of nodes that have none; {ANY_YAW} where a node's orientation is not known",
+        minimum=0.0,
+        maximum=ANY_YAW,
+        unit="rad",
+    )
     osm: bool = parameter(False, "write OpenStreetMap's tags and attributes under properties of nodes and edges")
     pointset: str | None = parameter(
         None, "name of the network and its pointset; default: the source's, else the map's"
@@ -119,6 +133,19 @@ class ListOptions:
 
     action: str = parameter(ACTION, "action of edges that name none")
     top_vel: float = parameter(0.55, "speed on edges without a limit", minimum=0.0, maximum=100.0, unit="m/s")
+    verts_radius: float = parameter(
+        RADIUS, "of the octagon around nodes that have no verts", minimum=1e-3, maximum=1000.0, unit="m"
+    )
+    xy_goal_tolerance: float = parameter(
+        TOLERANCES["xy_goal_tolerance"], "of nodes that have none", minimum=0.0, maximum=1000.0, unit="m"
+    )
+    yaw_goal_tolerance: float = parameter(
+        TOLERANCES["yaw_goal_tolerance"],
+        f"of nodes that have none; {ANY_YAW} where a node's orientation is not known",
+        minimum=0.0,
+        maximum=ANY_YAW,
+        unit="rad",
+    )
     osm: bool = parameter(False, "write OpenStreetMap's tags and attributes under properties of nodes and edges")
     pointset: str | None = parameter(None, "name of the pointset; default: the source's, else the map's")
 
@@ -543,6 +570,7 @@ class _Writer:
         self.options: WriteOptions | ListOptions = context.options if isinstance(context.options, kind) else kind()
         self.document = self._document()
         self.turn = _turn(self.document)
+        self.ring = ring(self.options.verts_radius)
         self.legacy = False  # whether the network at hand came as the older list, which lacks much that tmap2 asks for
         self.unwritten = UNWRITTEN if self.options.osm else UNWRITTEN | BULKY
         # Properties without anything for an item's own ``properties``.
@@ -789,6 +817,11 @@ class _Writer:
             f"      position:\n        x: {at[0]}\n        y: {at[1]}\n        z: {at[2]}\n"
         )
 
+    def _tolerances(self, known: bool) -> dict[str, float]:
+        """Of a node that has none. known: whether it has an orientation."""
+        yaw = self.options.yaw_goal_tolerance if known else ANY_YAW
+        return {"xy_goal_tolerance": self.options.xy_goal_tolerance, "yaw_goal_tolerance": yaw}
+
     def _node_template(
         self, rest: Mapping[str, Any], node: Mapping[str, Any], more: dict[str, Any] | None, *, known: bool, fill: bool
     ) -> list[str]:
@@ -796,13 +829,12 @@ class _Writer:
         inner = dict(node)
         if self.listed:
             own = _mapping_of(inner.get("properties"))
-            usual = TOLERANCES if known else {**TOLERANCES, "yaw_goal_tolerance": ANY_YAW}
-            tolerances = {key: own.get(key, value) for key, value in usual.items()}
+            tolerances = {key: own.get(key, value) for key, value in self._tolerances(known).items()}
             fixed = {"map": self.document["metric_map"], "pointset": self.document["pointset"]}
-            inner = {**LIST_NODE, **fixed, **tolerances, **inner}
+            inner = {**LIST_NODE, "verts": self.ring, **fixed, **tolerances, **inner}
         elif fill:
-            inner = {**NODE_TEMPLATE, **inner}
-            tolerances = TOLERANCES if known else {**TOLERANCES, "yaw_goal_tolerance": ANY_YAW}
+            inner = {**NODE_TEMPLATE, "verts": self.ring, **inner}
+            tolerances = self._tolerances(known)
             # The older layout has its tolerances beside the name.
             tolerances = {key: inner.get(key, value) for key, value in tolerances.items()}
             inner["properties"] = {**tolerances, **_mapping_of(inner.get("properties"))}
@@ -835,9 +867,11 @@ class _Writer:
                 fill(f"edges: {said}", "the usual ones", why)
         if filled["nodes"]:
             why = f"{filled['nodes']} nodes come from a format that does not say it"
-            fill("nodes: verts", f"an octagon of {RADIUS} m", f"{why}, where they have none")
+            fill("nodes: verts", f"an octagon of {self.options.verts_radius:g} m", f"{why}, where they have none")
             said = "map, pointset" if self.listed else "parent_frame, restrictions"
-            fill(f"nodes: tolerances, localise_by_topic, {said}", "the usual ones", why)
+            fill("nodes: xy_goal_tolerance", self.options.xy_goal_tolerance, f"{why}, where they have none")
+            fill("nodes: yaw_goal_tolerance", self.options.yaw_goal_tolerance, f"{why}, where they have an orientation")
+            fill(f"nodes: localise_by_topic, {said}", "the usual ones", why)
         if filled["orientations"]:
             fill("nodes: pose.orientation", [0.0, 0.0, 0.0, 1.0], f"{filled['orientations']} nodes have none")
         for what, count in sorted(self.dropped.items()):

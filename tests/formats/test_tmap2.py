@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app import formats
-from app.errors import BadUpload, MissingDatum, UnreadableFile
+from app.errors import BadUpload, Invalid, MissingDatum, UnreadableFile
 from app.formats import Group, Limits, ReadContext, WriteContext, _tmap, get_format
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
@@ -328,6 +328,31 @@ def from_elsewhere() -> Features:
 
 
 DATUM = Datum(53.2686, -0.5245)
+
+
+@pytest.mark.parametrize("name", ["tmap2", "tmap"])
+def test_what_nodes_get_can_be_chosen(name: str) -> None:
+    known = formats.get_format(name)
+    asked = {"verts_radius": "1.5", "xy_goal_tolerance": "0.2", "yaw_goal_tolerance": "0.5"}
+    context = WriteContext(options=formats.write_options(known, asked), title="farm")
+    (served,) = formats.write(known, Layers({NETWORK: from_elsewhere()}, DATUM), context).values()
+    listed = yaml.safe_load(served)
+    for entry in listed if name == "tmap" else listed["nodes"]:
+        node = entry["node"]
+        assert [math.hypot(v["x"], v["y"]) for v in node["verts"]] == pytest.approx([1.5] * 8)
+        said = node if name == "tmap" else node["properties"]
+        turned = node["name"] == "n2"
+        assert (said["xy_goal_tolerance"], said["yaw_goal_tolerance"]) == (0.2, 0.5 if turned else 6.29)
+    filled = {line["what"]: line["value"] for line in context.template}
+    assert filled["nodes: verts"] == "an octagon of 1.5 m"
+    assert (filled["nodes: xy_goal_tolerance"], filled["nodes: yaw_goal_tolerance"]) == (0.2, 0.5)
+    for wrong in ({"verts_radius": "0"}, {"yaw_goal_tolerance": "7"}, {"xy_goal_tolerance": "nan"}):
+        with pytest.raises(Invalid):
+            formats.write_options(known, wrong)
+    # A network of its own keeps what it says.
+    again = formats.read(formats.group({f"a.{name}": served}, name)[0][0], ReadContext())
+    (same,) = formats.write(known, again, WriteContext(title="farm")).values()
+    assert same == served
 
 
 def test_a_network_from_elsewhere_gets_defaults_and_keeps_its_attributes() -> None:
