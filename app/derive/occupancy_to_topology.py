@@ -32,25 +32,29 @@ if TYPE_CHECKING:
 RASTERS = (0.5, 0.1, 0.01)
 """Metres: a node is named after its place on the first of these on which no other node has the same."""
 
-BELONGS: Mapping[str, str] = {
-    "spacing": "skeleton",
-    "detour": "skeleton",
-    "samples": "roadmap",
-    "neighbours": "roadmap",
-    "max_edge": "roadmap",
-    "seed": "roadmap",
+BELONGS: Mapping[str, tuple[str, ...]] = {
+    "spacing": ("skeleton", "voronoi"),
+    "detour": ("skeleton",),
+    "samples": ("roadmap",),
+    "neighbours": ("roadmap",),
+    "max_edge": ("roadmap",),
+    "seed": ("roadmap",),
 }
-"""Parameters that only one method has."""
+"""Parameters that not every method has."""
+
+VORONOI_CELLS = 2**27
+"""Cells of the box around a grid's free cells of which a Voronoi diagram is made: it takes 12 to 30 bytes each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
     """How free space becomes a network."""
 
-    method: Literal["skeleton", "roadmap"] = parameter(
+    method: Literal["skeleton", "roadmap", "voronoi"] = parameter(
         "skeleton",
-        "how ways are found: the middle lines of free space, with straight ways through the open (skeleton), or random "
-        "samples joined where nothing is between (roadmap)",
+        "how ways are found: the middle lines of free space, with straight ways through the open (skeleton), random "
+        "samples joined where nothing is between (roadmap), or the lines that are farthest from all obstacles, also in "
+        "the open (voronoi, the generalised Voronoi diagram)",
     )
     grid: str | None = parameter(None, "which grid; default: map, else the only one of a level that is no filter mask")
     robot_radius: float = parameter(
@@ -58,7 +62,7 @@ class Parameters:
     )
     unknown: bool = parameter(False, "whether unknown cells may be driven through")
     tolerance: float = parameter(
-        0.1, "how far straight edges may be from the skeleton", minimum=0.0, maximum=100.0, unit="m"
+        0.1, "how far straight edges may be from the skeleton or diagram", minimum=0.0, maximum=100.0, unit="m"
     )
     spur: float = parameter(
         0.5,
@@ -76,7 +80,8 @@ class Parameters:
     )
     spacing: float = parameter(
         1.5,
-        "skeleton: longest distance of nodes along it, and between nodes in the open; 0: only its own corners",
+        "skeleton, voronoi: longest distance of nodes along it (skeleton: and between nodes in the open); 0: only its "
+        "own corners",
         minimum=0.0,
         maximum=1000.0,
         unit="m",
@@ -119,6 +124,7 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: s
         spur=parameters.spur / cell,
         tolerance=parameters.tolerance / cell,
         island=parameters.island / cell,
+        voronoi=parameters.method == "voronoi",
     )
     notes.drop("places", islands, f"{called}: under island={parameters.island:g} m across, no way to the rest")
     count, _ = _skeleton.pieces(graph)
@@ -134,6 +140,8 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: s
             seed=parameters.seed,
         )
         notes.drop("samples", alone, f"{called}: they see nothing to be joined to, or lie in places left out")
+    elif parameters.method == "voronoi":
+        graph = _skeleton.divided(graph, where, max(parameters.spacing / cell, 2.0)) if parameters.spacing else graph
     elif parameters.spacing > 0.0:
         spacing = max(parameters.spacing / cell, 2.0)
         graph = _skeleton.filled(
@@ -150,9 +158,10 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: s
 def _check(parameters: Parameters) -> None:
     """Refuse what the chosen method would ignore."""
     changed = [f.name for f in fields(parameters) if getattr(parameters, f.name) != f.default]
-    wrong = [n for n in changed if BELONGS.get(n, parameters.method) != parameters.method]
+    wrong = [n for n in changed if parameters.method not in BELONGS.get(n, (parameters.method,))]
     if wrong:
-        problems = [Problem(f"belongs to method={BELONGS[n]}, not to {parameters.method}", where=n) for n in wrong]
+        told = {n: " or ".join(BELONGS[n]) for n in wrong}
+        problems = [Problem(f"belongs to method={told[n]}, not to {parameters.method}", where=n) for n in wrong]
         raise Invalid("; ".join(f"{p.where}: {p.problem}" for p in problems), problems)
 
 
@@ -177,6 +186,11 @@ def _space(grid: OccupancyGrid, parameters: Parameters, called: str) -> Space:
             f"or the network itself"
         )
     where = _skeleton.space(free, row, column, parameters.robot_radius / grid.resolution)
+    if parameters.method == "voronoi" and where.mask.size > VORONOI_CELLS:
+        raise TooLarge(
+            f"{called} has free space on {where.mask.size} cells, method=voronoi takes at most {VORONOI_CELLS}: "
+            "ask for method=skeleton, or upload a coarser grid"
+        )
     if not where.cells:
         widest = _skeleton.widest(where) * grid.resolution
         raise CannotConvert(

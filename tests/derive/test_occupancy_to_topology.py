@@ -26,7 +26,7 @@ from app.model.frame import Level
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import NETWORK, Layers, PartKey
 
-METHODS = ("skeleton", "roadmap")
+METHODS = ("skeleton", "roadmap", "voronoi")
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config"
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -305,6 +305,44 @@ def test_a_narrow_passage_is_found_by_a_roadmap_with_few_samples() -> None:
         assert nx.number_weakly_connected_components(network) == 1
 
 
+def mean_clearance(g: OccupancyGrid, f: Features) -> float:
+    """Metres to the nearest obstacle, on average along all edges."""
+    clearance = distances(g)
+    lines = [e.geometry for e in f.of_kind("edge")]
+    at = [cells_at(g, along(line, g.resolution / 5)) for line in lines]
+    weight = [line.length for line in lines]
+    return float(np.average([clearance[a[:, 0], a[:, 1]].mean() for a in at], weights=weight))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_voronoi_ways_are_as_far_from_obstacles_as_can_be(seed: int) -> None:
+    g = grid(rooms(seed))
+    ways = {m: derived(g, method=m, spacing=0.0, robot_radius=0.2) for m in ("skeleton", "voronoi")}
+    assert mean_clearance(g, ways["voronoi"]) >= mean_clearance(g, ways["skeleton"])
+    assert mean_clearance(g, ways["voronoi"]) > mean_clearance(g, derived(g, robot_radius=0.2))
+
+
+def test_a_voronoi_diagram_by_hand() -> None:
+    """Two rooms of 4 × 4 m and a door of 0.9 m: through their middles and the door's, and nowhere into the corners."""
+    cells = np.full((42, 85), OCCUPIED)
+    cells[1:41, 1:41], cells[1:41, 44:84], cells[17:26, 41:44] = FREE, FREE, FREE
+    network = nx.Graph(check(grid(cells), derived(grid(cells), method="voronoi", spacing=0.0), 0.3))
+    at = np.array([a for _, a in network.nodes(data="at")])
+    assert at[:, 0].min() == pytest.approx(2.1, abs=0.15)
+    assert at[:, 0].max() == pytest.approx(6.4, abs=0.15)
+    assert abs(at[:, 1] - 2.1).max() < 0.2
+    # Around a post in the open the diagram is a ring in the middle between it and the walls.
+    cells = np.full((81, 81), OCCUPIED)
+    cells[1:-1, 1:-1] = FREE
+    cells[36:45, 36:45] = OCCUPIED
+    ring = nx.Graph(check(grid(cells), derived(grid(cells), method="voronoi", spacing=0.0), 0.3))
+    assert len(nx.cycle_basis(ring)) == 1
+    away = np.abs(np.array([a for _, a in ring.nodes(data="at")]) - 4.05).max(axis=1)
+    assert away.min() > 1.9
+    near = derived(grid(cells), method="voronoi", spacing=0.5)
+    assert max(e.geometry.length for e in near.of_kind("edge")) < 0.65
+
+
 def bad(cells: Any, **values: Any) -> str:
     with pytest.raises(CannotConvert) as caught:
         derived(grid(cells), **values)
@@ -366,8 +404,11 @@ def test_masks_are_no_maps_unless_named() -> None:
 def test_parameters_are_checked() -> None:
     with pytest.raises(Invalid, match="samples: belongs to method=roadmap, not to skeleton"):
         derived(grid(rooms()), samples=5)
-    with pytest.raises(Invalid, match="detour: belongs to method=skeleton"):
-        derived(grid(rooms()), method="roadmap", detour=2.0)
+    for method in ("roadmap", "voronoi"):
+        with pytest.raises(Invalid, match=f"detour: belongs to method=skeleton, not to {method}"):
+            derived(grid(rooms()), method=method, detour=2.0)
+    with pytest.raises(Invalid, match="spacing: belongs to method=skeleton or voronoi, not to roadmap"):
+        derived(grid(rooms()), method="roadmap", spacing=2.0)
     with pytest.raises(Invalid, match="at least 0"):
         parameters.parse(Parameters, {"robot_radius": "-1"})
     with pytest.raises(Invalid, match="must be one of"):

@@ -16,9 +16,10 @@ from scipy import ndimage
 from skimage.measure import euler_number, label
 from skimage.morphology import skeletonize
 
-from app.derive import Notes
+from app.derive import Notes, _skeleton
 from app.derive import _kernels_skeleton as kernels
 from app.derive import _kernels_space as space_kernels
+from app.derive import _kernels_voronoi as voronoi_kernels
 from app.derive.occupancy_to_topology import Parameters, network
 from app.errors import CannotConvert
 from app.model.grid import FREE, OccupancyGrid
@@ -71,6 +72,35 @@ def masks(count: int) -> list[Mask]:
             mask = ndimage.gaussian_filter(random.random((80, 90)), random.uniform(1, 4)) > 0.5
         out.append(mask)
     return out
+
+
+def ridges(mask: Mask) -> Mask:
+    """The generalised Voronoi diagram of a mask."""
+    where = _skeleton.space(np.pad(mask.astype(np.uint8), 1), 0, 0, 0.0)
+    padded = where.mask.copy()
+    assert _skeleton.ridges(padded, where.gap) == padded.sum()
+    assert set(np.unique(padded)) <= {0, 1}
+    return np.asarray(padded[1:-1, 1:-1] == 1)
+
+
+def test_voronoi_diagrams_keep_pieces_and_holes() -> None:
+    for mask in masks(240):
+        diagram = ridges(mask)
+        same_topology(diagram, mask)
+        one_cell_wide(diagram)
+
+
+def test_distances_to_the_nearest_obstacle_are_exact() -> None:
+    for mask in masks(30):
+        free = np.pad(mask.astype(np.uint8), 1)
+        gap = np.zeros(free.shape, np.uint16)
+        space_kernels.gaps(free, gap)
+        far, column = np.zeros(free.shape, np.int32), np.zeros(free.shape, np.int32)
+        voronoi_kernels.nearest(gap, far, column)
+        assert np.allclose(np.sqrt(far), ndimage.distance_transform_edt(free))
+        rows = np.arange(len(free))[:, None]
+        across = np.arange(free.shape[1])[None, :] - column
+        assert (across**2 + gap[rows, column].astype(np.int64) ** 2 == far).all()
 
 
 def test_random_masks_keep_their_topology_as_the_library_keeps_it() -> None:

@@ -1,0 +1,192 @@
+"""The generalised Voronoi diagram of free space, as native code.
+
+Cells are taken away in order of their distance to obstacles, nearest first, as long as that changes neither pieces nor
+holes (distance-ordered homotopic thinning: Pudney, Distance-ordered homotopic thinning, CVIU 72, 1998). Anchors stay:
+cells between obstacles that lie on about opposite sides of them. What is left are the ridges of the distance, and
+between them the ways along which the distance is largest.
+
+Masks are [height, width] with a border of zeros, as in ``_kernels_skeleton``.
+"""
+
+# numba has its own types for numbers: 64-bit integers and floats, whatever mypy makes of NumPy's.
+# mypy: disable-error-code="assignment,return-value,arg-type,no-any-return"
+
+from __future__ import annotations
+
+import numpy as np
+
+from app.derive._kernels_skeleton import _DX, _DY, _REDUNDANT
+from app.derive._kernels_space import I32, I64, U8, U16, gaps
+from app.derive._native import native
+
+
+def _simple() -> U8:
+    """By code of a neighbourhood (``_kernels_skeleton``): whether a cell can go without changing pieces or holes."""
+    out = np.zeros(256, np.uint8)
+    for code in range(256):
+        q = [1 - (code >> k & 1) for k in range(8)]
+        out[code] = sum(q[k] - q[k] * q[(k + 1) % 8] * q[(k + 2) % 8] for k in (0, 2, 4, 6)) == 1  # Yokoi's number
+    return out
+
+
+_SIMPLE = _simple()
+
+OPPOSITE = 1.6
+"""Obstacles that are this many times as far from each other as from a cell lie on opposite sides: 106 degrees as seen
+from it, so that the bisectors of right-angled corners lead nowhere, and a corridor's middle (180 degrees) stays."""
+
+
+@native
+def nearest(gap: U16, far: I32, column: I32) -> None:
+    """For each cell the squared distance to the nearest obstacle, and the column in which that lies.
+
+    The lower envelope of each row's parabolas (Felzenszwalb and Huttenlocher, Distance transforms of sampled functions,
+    2012); rows begin and end with an obstacle, so that the distance is less than half the width.
+    """
+    height, width = gap.shape
+    at = np.empty(width, np.int64)
+    until = np.empty(width + 1, np.float64)
+    for y in range(height):
+        n = 0
+        at[0] = 0
+        until[0], until[1] = -np.inf, np.inf
+        for x in range(1, width):
+            f = np.int64(gap[y, x]) * np.int64(gap[y, x]) + np.int64(x) * x
+            while True:
+                v = at[n]
+                g = np.int64(gap[y, v]) * np.int64(gap[y, v]) + v * v
+                s = (f - g) / (2.0 * (x - v))
+                if s > until[n]:
+                    break
+                n -= 1
+            n += 1
+            at[n] = x
+            until[n], until[n + 1] = s, np.inf
+        k = 0
+        for x in range(width):
+            while until[k + 1] < x:
+                k += 1
+            v = at[k]
+            g = np.int64(gap[y, v])
+            far[y, x] = g * g + (x - v) * (x - v)
+            column[y, x] = v
+
+
+@native
+def _row(gap: U16, y: int, x: int) -> int:
+    """The row of the obstacle nearest to (y, x) in its column."""
+    g = np.int64(gap[y, x])
+    return y - g if y >= g and gap[y - g, x] == 0 else y + g
+
+
+@native
+def anchors(mask: U8, gap: U16, far: I32, column: I32) -> int:
+    """Set bit 1 of the cells of the mask that lie between obstacles on opposite sides; how many these are."""
+    height, width = mask.shape
+    count = 0
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            if mask[y, x] == 0:
+                continue
+            ax = np.int64(column[y, x])
+            ay = np.int64(_row(gap, y, ax))
+            # In the middle of an odd number of cells: the same distance to both sides.
+            g = np.int64(np.sqrt(far[y, x]))
+            if g * g == far[y, x] and (
+                (y >= g and y + g < height and gap[y - g, x] == 0 and gap[y + g, x] == 0)
+                or (x >= g and x + g < width and gap[y, x - g] == 0 and gap[y, x + g] == 0)
+            ):
+                count += 1 if mask[y, x] & 2 == 0 else 0
+                mask[y, x] |= 2
+            for d in range(2):
+                v, u = y + d, x + 1 - d
+                if mask[v, u] == 0:
+                    continue
+                bx = np.int64(column[v, u])
+                by = np.int64(_row(gap, v, bx))
+                apart = np.sqrt((ax - bx) * (ax - bx) + (ay - by) * (ay - by))
+                # Neighbours see obstacles that are a cell farther apart, because they are at different places.
+                if apart - 1.0 >= OPPOSITE * (np.sqrt(far[y, x]) + np.sqrt(far[v, u])) / 2.0:
+                    if far[v, u] > far[y, x]:
+                        count += 1 if mask[v, u] & 2 == 0 else 0
+                        mask[v, u] |= 2
+                    else:
+                        count += 1 if mask[y, x] & 2 == 0 else 0
+                        mask[y, x] |= 2
+    return count
+
+
+@native
+def thin(mask: U8, order: I64, far: I32) -> int:
+    """Thin a mask in place, cells in this order (places in the flat mask, nearest to obstacles first); what is left.
+
+    Bit 1 marks anchors. In the end the mask is one cell wide and of zeros and ones.
+    """
+    width = mask.shape[1]
+    flat, key = mask.ravel(), far.ravel()
+    step = np.empty(8, np.int64)
+    for k in range(8):
+        step[k] = _DY[k] * width + _DX[k]
+    stack = np.empty(1024, np.int64)
+    for i in range(len(order)):
+        size = 1
+        stack[0] = order[i]
+        now = key[order[i]]
+        while size > 0:
+            size -= 1
+            cell = stack[size]
+            if flat[cell] != 1:  # gone, or an anchor
+                continue
+            code = 0
+            for k in range(8):
+                code |= (flat[cell + step[k]] & 1) << k
+            if _SIMPLE[code] == 0:
+                continue
+            flat[cell] = 0
+            if size + 8 > len(stack):
+                larger = np.empty(2 * len(stack), np.int64)
+                larger[:size] = stack[:size]
+                stack = larger
+            for k in range(8):
+                other = cell + step[k]
+                # Those that come later are looked at then.
+                if flat[other] == 1 and key[other] <= now:
+                    stack[size] = other
+                    size += 1
+    # Anchors two cells wide: those can go that are no ends.
+    left = np.empty(len(order), np.int64)
+    count = 0
+    for i in range(len(order)):
+        if flat[order[i]]:
+            flat[order[i]] = 1
+            left[count] = order[i]
+            count += 1
+    again = True
+    while again:
+        again = False
+        n = 0
+        for i in range(count):
+            cell = left[i]
+            code = 0
+            for k in range(8):
+                code |= flat[cell + step[k]] << k
+            if _REDUNDANT[code]:
+                flat[cell] = 0
+                again = True
+            else:
+                left[n] = cell
+                n += 1
+        count = n
+    return count
+
+
+def compile_all() -> None:
+    """Call every kernel once on a tiny grid."""
+    free = np.zeros((7, 9), np.uint8)
+    free[1:-1, 1:-1] = 1
+    gap = np.zeros(free.shape, np.uint16)
+    gaps(free, gap)
+    far, column = np.empty(free.shape, np.int32), np.empty(free.shape, np.int32)
+    nearest(gap, far, column)
+    anchors(free, gap, far, column)
+    thin(free, np.flatnonzero(free), far)
