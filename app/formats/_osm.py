@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
 from app.formats import Limits, _xml
+from app.model.features import alike
 
 Attributes = dict[str, str]
 Tags = dict[str, str]
@@ -170,6 +171,12 @@ def _pair(two: bytes) -> int:
     return two[0] * 256 + two[1]
 
 
+SCANNED = 2**20
+"""Bytes of nodes that are looked at together."""
+
+KNOWN_TEXTS, PATTERNS = 2**14, 64
+"""Attribute values, and lists of attribute names, that are kept for the next element."""
+
 _KNOWN = {_pair(p) for p in (b"?x", b"os", b"/o", b"bo", b"no", b"/n", b"wa", b"/w", b"re", b"/r", b"nd", b"ta", b"me")}
 
 
@@ -194,14 +201,27 @@ def _scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
     del buffer, opened
     _well_formed(data)
     count = {p: int(codes[_pair(p)]) for p in (b"no", b"/n", b"wa", b"re", b"nd", b"ta", b"me", b"bo")}
-    rows = _NODE.findall(data)
+    ids: list[int] = []
+    places: list[NDArray[np.float64]] = []
+    texts: list[bytes] = []
+    tagged: list[int] = []
+    at = 0
+    while at < len(data):  # a piece at a time: the matches take far more memory than what is kept of them
+        end = data.find(b"<node ", at + SCANNED)
+        end = len(data) if end < 0 else end
+        rows = _NODE.findall(data, at, end)
+        tagged += [k for k, row in enumerate(rows, len(ids)) if not row[5]]
+        ids += [int(row[0]) for row in rows]
+        texts += [row[1] + row[4] for row in rows]
+        places.append(np.array([(float(row[3]), float(row[2])) for row in rows]).reshape(-1, 2))
+        at = end
+    del rows
     bounds = _BOUNDS.findall(data, root.end()) if count[b"bo"] else []
-    if len(rows) != count[b"no"] or len(bounds) != count[b"bo"]:
+    if len(ids) != count[b"no"] or len(bounds) != count[b"bo"]:
         return None
     children = _Children()
     tags: dict[int, Tags] = {}
     if count[b"/n"]:
-        tagged = [k for k, row in enumerate(rows) if not row[5]]
         pieces = data.split(b"</node>")
         pieces.pop()
         if len(pieces) != len(tagged):
@@ -229,20 +249,15 @@ def _scan(data: bytes, limits: Limits, highways_only: bool) -> Data | None:
     cache: dict[bytes, Attributes] = {}
 
     def attributes(k: int) -> Attributes:
-        row = rows[k]
-        text = row[1] + row[4]
+        text = texts[k]
         known = cache.get(text)
         if known is None:
             known = cache[text] = children.attributes(text)
         return known
 
-    ids = [int(row[0]) for row in rows]
-    lonlat = np.empty((len(rows), 2))
-    lonlat[:, 0] = [float(row[3]) for row in rows]
-    lonlat[:, 1] = [float(row[2]) for row in rows]
     found = Data(
         ids,
-        lonlat,
+        np.concatenate(places),
         tags,
         attributes,
         ways,
@@ -271,9 +286,11 @@ def _well_formed(data: bytes) -> None:
 
 
 class _Texts(dict[bytes, str]):
-    """Raw attribute values -> text, each worked out once: keys and values of tags repeat a lot."""
+    """Raw attribute values -> text, the repeated ones worked out once: keys and values of tags repeat a lot."""
 
     def __missing__(self, raw: bytes) -> str:
+        if len(self) >= KNOWN_TEXTS:
+            self.clear()  # times and changesets hardly repeat
         text = self[raw] = unescape(raw)
         return text
 
@@ -281,17 +298,28 @@ class _Texts(dict[bytes, str]):
 class _Children:
     """Reads the elements inside nodes, ways and relations, counting them; ``regular`` falls at the first odd one."""
 
-    __slots__ = ("members", "nds", "regular", "tagged", "texts")
+    __slots__ = ("alike", "members", "nds", "regular", "tagged", "texts")
 
     def __init__(self) -> None:
         self.nds = self.members = self.tagged = 0
         self.regular = True
         self.texts = _Texts()
+        self.alike: dict[tuple[bytes, ...], Attributes] = {}
 
     def attributes(self, text: bytes) -> Attributes:
         """The attributes in this part of a tag."""
         texts = self.texts
-        return {texts[k]: texts[v] for k, v in _ATTRIBUTE.findall(text)}
+        found = _ATTRIBUTE.findall(text)
+        keys = tuple([k for k, _ in found])
+        pattern = self.alike.get(keys)
+        if pattern is None:
+            if len(self.alike) >= PATTERNS:
+                return {texts[k]: texts[v] for k, v in found}
+            pattern = self.alike[keys] = alike(*[texts[k] for k in keys])
+        out = pattern.copy()
+        for name, (_, v) in zip(pattern, found, strict=True):
+            out[name] = texts[v]
+        return out
 
     def tags(self, body: bytes, others: int) -> Tags:
         """The tags in an element's body that has ``others`` further elements."""

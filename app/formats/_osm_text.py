@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from io import BytesIO
 from typing import Any
 
 from app.formats._osm import INT64
@@ -47,16 +48,16 @@ def document(
 
     Lines become bytes a few at a time: as texts all of them would take four times the memory.
     """
-    done = bytearray()
+    done = BytesIO()  # whose content is taken out without a copy
     lines: list[str] = []
     for line in _lines(head, nodes, ways, relations):
         lines.append(line)
         if len(lines) == LINES:
             lines.append("")
-            done += "\n".join(lines).encode()
+            done.write("\n".join(lines).encode())
             lines.clear()
-    done += "\n".join([*lines, ""]).encode()
-    return bytes(done)
+    done.write("\n".join([*lines, ""]).encode())
+    return done.getvalue()
 
 
 def _lines(

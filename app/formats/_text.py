@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from io import BytesIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,3 +29,12 @@ def numbers(values: NDArray[np.float64] | Iterable[float], decimals: int = METRE
     if large.any():
         rounded[large] = exact[large]
     return list(map(repr, rounded.tolist()))
+
+
+def encoded(pieces: list[str]) -> bytes:
+    """The pieces as UTF-8, one after the other. The list is emptied meanwhile, so that no text is held twice."""
+    pieces.reverse()
+    out = BytesIO()  # whose content is taken out without a copy
+    while pieces:
+        out.write(pieces.pop().encode())
+    return out.getvalue()

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, ReadContext, WriteContext, _yaml, all_formats
-from app.formats._text import METRES, numbers
+from app.formats._text import METRES, encoded, numbers
 from app.model.features import Features, Properties, from_columns, points, unique_ids
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, PartKey
@@ -554,7 +554,7 @@ def write(layers: Layers, context: WriteContext, *, listed: bool = False) -> byt
     listed: as the older list. Wgs84 items are brought to local metres (MissingDatum without a datum). What the source
     did not say is filled in.
     """
-    return _Writer(layers, context, listed=listed).file().encode()
+    return _Writer(layers, context, listed=listed).file()
 
 
 Lines = list[tuple[int, str, str]]
@@ -620,8 +620,8 @@ class _Writer:
             self.context.fill("transformation", "identity, from map to topo_map", "no source names it")
         return document
 
-    def file(self) -> str:
-        """The whole text."""
+    def file(self) -> bytes:
+        """The whole file."""
         nodes: Lines = []
         taken: set[str] = set()
         networks = self.layers.vector("topology")
@@ -632,10 +632,14 @@ class _Writer:
             why = "the format knows no levels: all networks are joined, 2-D points at their level's elevation"
             self.context.drop("levels of nodes and edges", count, why)
         self._report()
+        items = [text for _, _, text in sorted(nodes)]
+        nodes.clear()
         if self.listed:
-            return _listed(nodes).removeprefix("\n").lstrip(" ")
+            return encoded([items[0].lstrip(" "), *items[1:]] if items else ["[]\n"])
         before, after = _split({**self.document, "nodes": None}, 0, "nodes")
-        return f"{before}{_listed(nodes)}{after}"
+        pieces = [before, "\n" if items else " []\n", *items, after]
+        items.clear()
+        return encoded(pieces)
 
     def _network(self, part: Features, level: str, taken: set[str]) -> Lines:
         """The nodes of a network, each with its edges."""
@@ -655,9 +659,9 @@ class _Writer:
             if self._is_plain(p, self.plain_node) and "orientation" not in p and p.get("name", name) == name:
                 self.filled["nodes"] += 1
                 self.filled["orientations"] += 1
-                text = plain(said[i], _listed(edges[i]), at)
+                text = plain(said[i], _listed(edges.pop(i)), at)
             else:
-                text = self._node(p, name, said[i], at, edges[i])
+                text = self._node(p, name, said[i], at, edges.pop(i))
             out.append((len(name), name, text))
         return out
 

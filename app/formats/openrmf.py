@@ -25,7 +25,6 @@ that was moved by an edit gets vertices where it stands.
 
 from __future__ import annotations
 
-import io
 import math
 import re
 from collections import Counter
@@ -43,7 +42,7 @@ from app.errors import MissingLayer
 from app.formats import Files, Format, Needs, ReadContext, WriteContext, _openrmf_rules, _rmf, _yaml, register
 from app.formats._network import own
 from app.formats._rmf import BUILDING, NAV_GRAPH, Array, Flow, index, listing, mapping, number, refuse, value_of
-from app.formats._text import DEGREES, METRES, numbers
+from app.formats._text import DEGREES, METRES, encoded, numbers
 from app.model.features import Features, Properties, alike, features, from_columns, points, segments, unique_ids
 from app.model.frame import GROUND, Level
 from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
@@ -792,11 +791,7 @@ class _Writer:
         text.append(_yaml.mapping(after, 0) if after else "")
         self._report()
         levels.clear()
-        text.reverse()
-        out = io.BytesIO()
-        while text:  # each piece is let go where it is written
-            out.write(text.pop().encode())
-        return {FILE: out.getvalue(), **dict(sorted(self.used.items()))}
+        return {FILE: encoded(text), **dict(sorted(self.used.items()))}
 
     def _top(self) -> dict[str, Any]:
         top = {key: value for key, value in self.building.items() if key not in ("levels", "lifts")}

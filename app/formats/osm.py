@@ -49,7 +49,7 @@ from app.formats._osm import INT64, Attributes, Data, Tags, Way, is_pbf, parse, 
 from app.formats._osm_text import NOTHING, Node, as_texts, attribute_text, element_id, integers, plain
 from app.formats._text import DEGREES, numbers
 from app.model import osm_tags
-from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, points, segments
+from app.model.features import NO_GEOMETRY, Features, Properties, alike, from_columns, points, segments
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, Part, PartKey
 
@@ -382,7 +382,13 @@ class _Network:
         data = self.data
         wanted = sorted(self.place[i] for i in self.used)
         ids = [f"n{data.ids[k]}" for k in wanted]
-        properties: list[Properties] = [{"kind": "node", "osm": _of_node(data, k)} for k in wanted]
+        pattern, plain_edge = alike("kind", "osm"), alike("kind", "source", "target", "osm")
+        properties: list[Properties] = []
+        for k in wanted:
+            node = pattern.copy()
+            node["kind"], node["osm"] = "node", _of_node(data, k)
+            properties.append(node)
+        name_of = dict(zip((data.ids[k] for k in wanted), ids, strict=True))
         source: list[int] = []
         target: list[int] = []
         for way, edges in self.highways:
@@ -392,16 +398,14 @@ class _Network:
             target += edges.target
             there, back = edge_words(way.tags, "forward"), edge_words(way.tags, "backward")
             refs = way.refs
-            properties += [
-                {
-                    "kind": "edge",
-                    "source": f"n{a}",
-                    "target": f"n{b}",
-                    **(there if there == back or refs[k] == a else back),
-                    "osm": said,
-                }
-                for k, a, b in zip(edges.segment, edges.source, edges.target, strict=True)
-            ]
+            for k, a, b in zip(edges.segment, edges.source, edges.target, strict=True):
+                words = there if there == back or refs[k] == a else back
+                if words:
+                    edge = {"kind": "edge", "source": name_of[a], "target": name_of[b], **words, "osm": said}
+                else:
+                    edge = plain_edge.copy()
+                    edge["kind"], edge["source"], edge["target"], edge["osm"] = "edge", name_of[a], name_of[b], said
+                properties.append(edge)
         geometry = points(data.lonlat[wanted]) if wanted else np.empty(0, object)
         if source:
             start = np.fromiter(map(self.place.__getitem__, source), np.intp, len(source))
@@ -419,12 +423,19 @@ def _warn_twice(what: str, ids: list[int], context: ReadContext) -> None:
         seen.add(identity)
 
 
+_ATTRIBUTES_ONLY = alike("attributes")
+
+
 def _of_node(data: Data, k: int) -> dict[str, Any]:
-    said: dict[str, Any] = {}
-    if tags := data.tags.get(k):
-        said["tags"] = tags
-    if attributes := data.attributes(k):
+    tags, attributes = data.tags.get(k), data.attributes(k)
+    said: dict[str, Any]
+    if attributes and not tags:
+        said = _ATTRIBUTES_ONLY.copy()
         said["attributes"] = attributes
+    else:
+        said = {"tags": tags} if tags else {}
+        if attributes:
+            said["attributes"] = attributes
     if children := data.node_children.get(k):
         said["children"] = [list(c) for c in children]
     return said

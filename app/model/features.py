@@ -226,6 +226,9 @@ def alike(*keys: str) -> dict[str, Any]:
     of the same keys (PEP 412; a copy that gets another key becomes one with a table of its own).
     """
 
+    if any(key.startswith("__") for key in keys):  # names that Python gives a meaning
+        return dict.fromkeys(keys)
+
     class Pattern:
         pass
 

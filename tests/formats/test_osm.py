@@ -173,6 +173,44 @@ def test_both_ways_through_xml_and_a_reader_who_wants_less(name: str, shared: Pa
     assert shapely.equals(a.geometry, b.geometry).all()
 
 
+def said(data: _osm.Data) -> Any:
+    """All that was read, to be compared."""
+    nodes = [(i, at, data.tags.get(k), data.attributes(k)) for k, (i, at) in enumerate(zip(data.ids, data.lonlat.tolist(), strict=True))]  # fmt: skip  # noqa: E501
+    return nodes, data.ways, data.relations, data.root, data.bounds
+
+
+@pytest.mark.parametrize("piece", [1, 50, 300, 1000])
+def test_nodes_are_scanned_piece_by_piece(piece: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    tag = '<tag k="natural" v="tree"/>'
+    nodes = [
+        f' <node id="{k}" version="{k % 3}" lat="{k / 7:.7f}" lon="-{k}"' + (f">{tag}</node>" if k % 4 == 0 else "/>")
+        for k in range(1, 40)
+    ]
+    way = ' <way id="5" version="1">\n  <nd ref="1"/>\n  <nd ref="39"/>\n  <tag k="highway" v="path"/>\n </way>'
+    text = "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', '<osm version="0.6">', *nodes, way, "</osm>", ""])
+    data = text.encode()
+    whole = _osm._events(data, Limits())
+    monkeypatch.setattr(_osm, "SCANNED", piece)
+    pieces = _osm._scan(data, Limits(), False)
+    assert pieces is not None
+    assert len(pieces.ids) > 5
+    assert said(pieces) == said(whole)
+
+
+def test_attributes_of_any_name_are_kept_however_many_lists_of_them_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_osm, "PATTERNS", 3)
+    monkeypatch.setattr(_osm, "KNOWN_TEXTS", 2)
+    names = ["version", "__class__", "__dict__", "user", "uid", "changeset", "x:y", "a.b-c"]
+    rows = [f'<node id="{k}" {n}="{k} &amp; {n}" visible="true" lat="1.5" lon="{k}"/>' for k, n in enumerate(names, 1)]
+    text = f'<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6">\n{" ".join(rows)}\n</osm>'.encode()
+    found = _osm._scan(text.replace(b"x:y", b"x_y"), Limits(), False)
+    assert found is not None
+    expected = [
+        {n.replace(":", "_"): f"{k} & {n.replace(':', '_')}", "visible": "true"} for k, n in enumerate(names, 1)
+    ]
+    assert [found.attributes(k) for k in range(len(names))] == expected
+
+
 def test_defective_files_as_their_authors_mean_them(shared: Path, same: Callable[..., list[str]]) -> None:
     folder = shared / "data/osm/osm-testdata-xml"
     for case in sorted(folder.iterdir()):
