@@ -2,7 +2,8 @@
 
 Ink is what is darker than Otsu's threshold between ink and paper. A room is what cannot be reached from the edge of the
 picture without crossing ink or a gap narrower than ``gap`` (doors, dashed lines). A shade between ink and paper that
-fills much of the picture evenly is no room either: the grey of ROS maps means unknown.
+fills much of the picture evenly is the grey of ROS maps, which means unknown: such a plan tells itself what is outside,
+so all of its paper is free.
 """
 
 from __future__ import annotations
@@ -114,8 +115,12 @@ def grid_of(picture: Picture, how: Plan, notes: Notes, name: str) -> OccupancyGr
     paper, shaded = _looked_up(~unknown, picture, frame)
     walls, specks = _without_specks(walls, how.speck / resolution**2)
     notes.drop("marks", specks, f"{name}: ink of less than {how.speck:g} m² is dirt or writing")
-    outside = _outside(walls, how.gap / 2 / resolution)
-    inside = _rooms(~outside & (walls == 0) & paper & ~shaded, ROOM / resolution**2)
+    told = bool(unknown.any())
+    if told:
+        inside = (walls == 0) & paper & ~shaded
+    else:
+        outside = _outside(walls, how.gap / 2 / resolution)
+        inside = _rooms(~outside & (walls == 0) & paper, ROOM / resolution**2)
     if not inside.any() and not how.outside_free:
         raise CannotConvert(
             f"{name} encloses no room: its walls have openings wider than gap={how.gap:g} m. Give a wider gap, or "
@@ -126,7 +131,7 @@ def grid_of(picture: Picture, how: Plan, notes: Notes, name: str) -> OccupancyGr
         cells[paper & ~shaded] = FREE
     cells[inside] = FREE
     near = walls == 1
-    if inside.any() and not how.outside_free:
+    if inside.any() and not told and not how.outside_free:
         away = cv2.distanceTransform((~inside).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
         far = near & (away > REACH / resolution)
         notes.drop("cells of ink", int(far.sum()), f"{name}: more than {REACH:g} m from any room")
@@ -144,7 +149,9 @@ def _shades(grey: NDArray[np.uint8], level: int, notes: Notes, name: str) -> NDA
     if not shades:
         return np.zeros(grey.shape, bool)
     told = ", ".join(map(str, shades))
-    notes.warn(f"{name}: the even grey {told} is taken as unknown, as in the maps of ROS", where="imagery")
+    notes.warn(
+        f"{name}: the even grey {told} is taken as unknown, as in the maps of ROS: gap is not needed", where="imagery"
+    )
     return np.asarray(np.isin(grey, shades))
 
 
