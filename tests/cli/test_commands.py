@@ -111,7 +111,8 @@ def test_a_grid_gets_its_name_and_a_merge_deletes_nothing(fleetmap: Fleetmap, ne
     told = fleetmap("import", *files, "-e", "merged", "--grid", "keepout", "--mode", "merge")
     assert told.status == 0, told.err
     assert fleetmap("export", "merged", "occupancy_grid", "-o", f"{tmp_path}/out/").status == 0
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"keepout.yaml", "keepout.pgm"}
+    written = {p.name for p in (tmp_path / "out").iterdir()}
+    assert written == {"keepout.yaml", "keepout.pgm", "keepout_filter_info.yaml"}
     only = fleetmap("export", "merged", "occupancy_grid", "--file", "keepout.yaml", "-o", tmp_path / "one.yaml")
     assert only.status == 0, only.err
     assert (tmp_path / "one.yaml").read_bytes() == (tmp_path / "out" / "keepout.yaml").read_bytes()
