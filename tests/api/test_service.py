@@ -72,8 +72,9 @@ def test_formats(api: Api) -> None:
         "location", "objects", "topology", "occupancy", "voxels", "imagery", "zones",
     }  # fmt: skip
     assert grid["information"]["occupancy"] == "raw"
-    assert grid["information"]["voxels"] == "-"
-    assert known["kml"]["information"]["occupancy"] == "-", "a KML says where a grid lies, not what is in it"
+    assert grid["information"]["voxels"] == "derived"
+    assert grid["information"]["location"] == "-"
+    assert known["kml"]["information"]["occupancy"] == "derived", "a KML says where a grid lies, not what is in it"
     assert known["kml"]["information"]["topology"] in ("raw", "derived")
     option = next(o for o in grid["options"] if o["name"] == "file_type")
     assert option["schema"]["enum"] == ["pgm", "png"]

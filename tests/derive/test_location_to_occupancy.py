@@ -68,6 +68,6 @@ def test_it_is_the_last_way_to_a_grid() -> None:
     plan = derive.plan(both, frozenset({"occupancy"}))
     assert plan is not None
     assert [s.name for s in plan.steps] == ["objects_to_occupancy"]
-    plan = derive.plan(both, frozenset({"occupancy"}), frozenset({"objects_to_occupancy"}))
+    plan = derive.plan(both, frozenset({"occupancy"}), frozenset({"objects_to_occupancy", "objects_to_voxels"}))
     assert plan is not None
     assert plan.steps[-1].name == "location_to_occupancy"
