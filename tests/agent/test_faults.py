@@ -129,7 +129,7 @@ def test_sigterm_ends_it_in_the_middle_of_a_download(place: str, robot: Start, g
     time.sleep(0.3)
     begun = time.monotonic()
     assert one.stop() == 0
-    assert time.monotonic() - begun < 5
+    assert time.monotonic() - begun < 60
 
 
 @pytest.fixture

@@ -469,4 +469,4 @@ def test_a_large_file_in_time() -> None:
     started = time.monotonic()
     layers = read(data)
     assert orjson.loads(write(layers)) == orjson.loads(data)
-    assert time.monotonic() - started < 15
+    assert time.monotonic() - started < 60

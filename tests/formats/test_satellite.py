@@ -694,7 +694,7 @@ def test_many_pictures_of_one_upload_are_sorted_in_time() -> None:
         }
     start = time.monotonic()
     groups, rest = formats.group(files)
-    assert time.monotonic() - start < 10.0
+    assert time.monotonic() - start < 60
     assert len(groups) == 4000
     assert rest == []
     assert all(len(g.files) == 2 for g in groups)
