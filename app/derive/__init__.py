@@ -54,7 +54,8 @@ class Derivation:
 
     makes: names of the parts that it makes, where these are others than the usual one. Such a step is no way to the
     layer; it is taken where a part of such a name is asked for and not stored, and is given the layer's usual part,
-    whose frame it may take.
+    whose frame it may take. last: what it makes is good for a map and not for deriving more (a grid that knows of no
+    obstacle).
     """
 
     name: str
@@ -67,6 +68,7 @@ class Derivation:
     function: Function
     also: frozenset[Layer] = frozenset()
     makes: frozenset[str] = frozenset()
+    last: bool = False
 
     def step(self) -> Step:
         """The derivation as it stands in a plan, with its default parameters."""
@@ -117,6 +119,7 @@ def derives(
     version: int = 1,
     also: frozenset[Layer] = frozenset(),
     makes: frozenset[str] = frozenset(),
+    last: bool = False,
 ) -> Callable[[Function], Function]:
     """Declare a function as a derivation; its name is its id, its docstring's first line its title."""
 
@@ -125,7 +128,7 @@ def derives(
         if name in _registry:
             raise ValueError(f"derivation {name} is declared twice")
         title = (function.__doc__ or name).strip().splitlines()[0]
-        known = (title, gives, frozenset(needs), cost, version, parameters, function, also, makes)
+        known = (title, gives, frozenset(needs), cost, version, parameters, function, also, makes, last)
         _registry[name] = Derivation(name, *known)
         return function
 
@@ -160,7 +163,10 @@ def plan(available: frozenset[Layer], wanted: frozenset[Layer], without: frozens
         if have in done:
             continue
         done.add(have)
+        dead = {step.gives for step in steps if all_derivations()[step.name].last}
         for d in all_derivations().values():
+            if d.needs & dead:
+                continue
             if d.needs <= have and d.gives not in have and d.name not in without and not d.makes:
                 pushed += 1
                 heapq.heappush(queue, (cost + d.cost, pushed, have | {d.gives}, (*steps, d.step())))

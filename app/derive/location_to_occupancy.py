@@ -28,7 +28,7 @@ class Parameters:
     )
 
 
-@derives(gives="occupancy", needs={"location"}, parameters=Parameters, cost=50.0)
+@derives(gives="occupancy", needs={"location"}, parameters=Parameters, cost=50.0, last=True)
 def location_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """A blank occupancy grid: free inside the fence, unknown outside; it knows of no obstacle.
 

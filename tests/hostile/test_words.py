@@ -46,7 +46,7 @@ WORDS = (
     "value", "expires", "pose", "size", "datum", "bounds", "attribution", "data", "style", "layer", "level", "part", "more",
     *formats.all_formats(),
 )  # fmt: skip
-ROUNDS = 150
+ROUNDS = 60
 FOR_EACH = 6
 
 
