@@ -286,10 +286,10 @@ def _datum(layers: Layers) -> str:
     )
 
 
-def _stated(part: Features) -> list[Any]:
+def _stated(part: Features) -> list[str]:
     """The licences and credits that a part's own document tells."""
     said = part.document.get("attribution")
-    return said if isinstance(said, list) else []
+    return [text for text in said if isinstance(text, str)] if isinstance(said, list) else []
 
 
 def _folder(key: PartKey, part: Features, layers: Layers, frame: LocalFrame | None, shared: Sequence[str] = ()) -> str:

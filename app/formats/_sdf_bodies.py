@@ -143,7 +143,7 @@ class Bodies:
         """The shapes whose words are known and whose files are there; the files go along."""
         out = []
         for shape in shapes:
-            if shape.get("type") not in _sdf.SHAPES:
+            if str(shape.get("type")) not in _sdf.SHAPES:
                 self._lost[f"shapes of objects of kind {kind}", f"Gazebo knows no {str(shape.get('type'))[:40]}"] += 1
                 continue
             if shape["type"] in ("mesh", "heightmap"):

@@ -807,6 +807,8 @@ class _Writer:
                 if len(refs) != size:  # redrawn: its points are not those that it came with
                     continue
                 ways[known[1]] = (refs, as_texts(said.get("attributes")))
+            if any(r not in level.nodes for r in refs):
+                continue  # a point that it refers to is not among them: somebody has changed it
             for r in refs:
                 if r not in row:
                     row[r] = len(xyz)
