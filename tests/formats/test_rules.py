@@ -695,12 +695,12 @@ def test_datum(old: str, new: str, expected: Found) -> None:
 
 
 # --- all of them --------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(("name", "files"), CASES)
+@pytest.mark.parametrize(
+    ("name", "files"), [case for case in CASES if formats.get_format(str(case.values[0])).check is not None]
+)
 def test_a_check_of_damaged_files_ends_in_findings(name: str, files: dict[str, bytes]) -> None:
     """Whatever the bytes are, there is no crash; what cannot be parsed is an error."""
     known = formats.get_format(name)
-    if known.check is None:
-        pytest.skip("no rules yet")
     for victim, data in files.items():
         for damaged in mutations(data, seed=len(victim)):
             for problem in formats.check(known, {**files, victim: damaged}):
