@@ -98,14 +98,10 @@ class Ingest:
         """
         _check_upload(upload)
         key = _idempotency(idempotency, _fingerprint(upload))
-        replayed = self._replayed(environment, key)
-        if replayed is not None:
-            return replayed
         hints = Hints(upload.format, upload.layer, upload.level, upload.grid, dict(upload.options))
         paths = {f.name: f.path for f in upload.files}
-        for last in _tries(if_match):
-            base = self._store.version(environment)
-            check_if_match(if_match, base)
+
+        def once(base: Version) -> Outcome:
             proposal: Proposal = self._in_worker(prepare_upload, base, paths, hints, upload.mode, self._limits)
             notes = {n.name: n for n in proposal.notes}
             if upload.dry_run:
@@ -114,14 +110,11 @@ class Ingest:
                 ]
                 return Outcome("dry_run", None, self._preview(base, proposal, sources, author, upload.message))
             sources = self._keep(upload, proposal)
-            try:
-                return self._commit(
-                    environment, base, proposal.prepared, author, upload.message, sources, proposal.warnings, key
-                )
-            except StaleParent:
-                if last:
-                    raise
-        raise StaleParent(f"{environment} changes faster than this upload can be taken in: try again")
+            return self._commit(
+                environment, base, proposal.prepared, author, upload.message, sources, proposal.warnings, key
+            )
+
+        return self._on_head(environment, key, if_match, once, "this upload can be taken in")
 
     def edit(
         self,
@@ -138,20 +131,13 @@ class Ingest:
             reason = f"nested deeper than {MAX_DEPTH} lists and objects"
             raise Invalid(f"the changes are {reason}", [Problem(reason, where="changes")])
         key = _idempotency(idempotency, _digest(["edit", list(changes), message]))
-        replayed = self._replayed(environment, key)
-        if replayed is not None:
-            return replayed
-        for last in _tries(if_match):
-            base = self._store.version(environment)
-            check_if_match(if_match, base)
+
+        def once(base: Version) -> Outcome:
             wanted, warnings = edit_changes(self._store, base, changes)
             prepared: Prepared = self._in_worker(prepare_changes, base, wanted)
-            try:
-                return self._commit(environment, base, prepared, author, message, (), warnings, key)
-            except StaleParent:
-                if last:
-                    raise
-        raise StaleParent(f"{environment} changes faster than this edit can be taken in: try again")
+            return self._commit(environment, base, prepared, author, message, (), warnings, key)
+
+        return self._on_head(environment, key, if_match, once, "this edit can be taken in")
 
     def derive(
         self,
@@ -169,20 +155,13 @@ class Ingest:
         """
         check_wish(wish)
         key = _idempotency(idempotency, _digest(["derive", wish.method, dict(wish.values), wish.replace, message]))
-        replayed = self._replayed(environment, key)
-        if replayed is not None:
-            return replayed
-        for last in _tries(if_match):
-            base = self._store.version(environment)
-            check_if_match(if_match, base)
+        text = message or f"Derived by {wish.method}"
+
+        def once(base: Version) -> Outcome:
             prepared, warnings = self._in_worker(prepare_derivation, base, wish, what="the layer could not be derived")
-            try:
-                text = message or f"Derived by {wish.method}"
-                return self._commit(environment, base, prepared, author, text, (), warnings, key)
-            except StaleParent:
-                if last:
-                    raise
-        raise StaleParent(f"{environment} changes faster than a layer can be derived: try again")
+            return self._commit(environment, base, prepared, author, text, (), warnings, key)
+
+        return self._on_head(environment, key, if_match, once, "a layer can be derived")
 
     def fetch_imagery(
         self,
@@ -199,7 +178,8 @@ class Ingest:
         Raises CannotDerive (no provider, or what it sends is of no use), MissingLayer or MissingDatum, Invalid,
         Unavailable (the provider is down), Conflict, StaleParent.
         """
-        if self.provider is None:
+        provider = self.provider
+        if provider is None:
             raise CannotDerive(
                 "no imagery provider is set up: the operator sets FLEETMAP_IMAGERY_URL, FLEETMAP_IMAGERY_KIND and, "
                 "where it needs one, FLEETMAP_IMAGERY_TOKEN",
@@ -207,30 +187,22 @@ class Ingest:
             )
         chosen = parameters.parse(online.Parameters, wish.values, f"parameter of {online.METHOD}")
         key = _idempotency(idempotency, _digest(["fetch", dict(wish.values), wish.replace, message]))
-        replayed = self._replayed(environment, key)
-        if replayed is not None:
-            return replayed
-        asked: online.Sheet | None = None
-        answers: tuple[bytes | None, ...] = ()
-        for last in _tries(if_match):
-            base = self._store.version(environment)
-            check_if_match(if_match, base)
+        text = message or f"Fetched from {provider.host}"
+        kept: list[tuple[online.Sheet, tuple[bytes | None, ...]]] = []
+
+        def once(base: Version) -> Outcome:
             online.check_free(base, chosen, replace=wish.replace)
             site = self._store.load(base, sorted(e.key for e in base.parts if e.key.layer == "location" and e.count))
-            sheet = online.sheet(self.provider, online.site_box(site, chosen), chosen.resolution)
-            if sheet != asked:
-                asked, answers = sheet, tuple(online.Fetcher(self.provider).fetch(sheet.blocks))
-            fetched = online.Fetched(sheet, answers, chosen, self.provider.told(chosen), self.provider.attribution)
+            sheet = online.sheet(provider, online.site_box(site, chosen), chosen.resolution)
+            if not kept or kept[-1][0] != sheet:  # the same site again: what was fetched still holds
+                kept.append((sheet, tuple(online.Fetcher(provider).fetch(sheet.blocks))))
+            fetched = online.Fetched(sheet, kept[-1][1], chosen, provider.told(chosen), provider.attribution)
             prepared, warnings = self._in_worker(
                 online.prepare_picture, base, fetched, self._limits, what="the fetched picture could not be read"
             )
-            try:
-                text = message or f"Fetched from {self.provider.host}"
-                return self._commit(environment, base, prepared, author, text, (), warnings, key)
-            except StaleParent:
-                if last:
-                    raise
-        raise StaleParent(f"{environment} changes faster than a picture can be fetched: try again")
+            return self._commit(environment, base, prepared, author, text, (), warnings, key)
+
+        return self._on_head(environment, key, if_match, once, "a picture can be fetched")
 
     def align(
         self,
@@ -251,20 +223,16 @@ class Ingest:
         if replayed is not None and replayed.version is not None:
             told = told_before(replayed.version, wish)
             return dataclasses.replace(replayed, body=_aligned(told, replayed.version, replayed.version.warnings))
-        for last in _tries(if_match):
-            base = self._store.version(environment)
-            check_if_match(if_match, base)
+        text = message or f"Aligned the grid {wish.level}/{wish.grid}"
+
+        def once(base: Version) -> Outcome:
             found: Aligned = self._in_worker(prepare_alignment, base, wish, what="the grid could not be aligned")
             if found.prepared is None:
                 return Outcome("dry_run", None, _aligned(found.told, None, found.warnings))
-            try:
-                text = message or f"Aligned the grid {wish.level}/{wish.grid}"
-                made = self._commit(environment, base, found.prepared, author, text, (), found.warnings, key)
-                return dataclasses.replace(made, body=_aligned(found.told, made.version, found.warnings))
-            except StaleParent:
-                if last:
-                    raise
-        raise StaleParent(f"{environment} changes faster than a grid can be aligned: try again")
+            made = self._commit(environment, base, found.prepared, author, text, (), found.warnings, key)
+            return dataclasses.replace(made, body=_aligned(found.told, made.version, found.warnings))
+
+        return self._on_head(environment, None, if_match, once, "a grid can be aligned")
 
     def revert(
         self,
@@ -278,43 +246,56 @@ class Ingest:
     ) -> Outcome:
         """A new version with an old one's content."""
         key = _idempotency(idempotency, _digest(["revert", to, message]))
+        text = message or f"Revert to version {to}"
+
+        def once(base: Version) -> Outcome:
+            same = self._store.version(environment, to).root == base.root
+            noted = Idempotency(key.key, UNCHANGED + key.fingerprint) if same and key is not None else key
+            made = self._store.revert(
+                environment, to, author=author, message=text, expected=base.number, idempotency=noted
+            )
+            return Outcome("unchanged" if same else "created", made, made.as_dict())
+
+        return self._on_head(environment, key, if_match, once, "it can be reverted")
+
+    def set_datum(
+        self, environment: str, datum: Datum, *, author: str, if_match: str | None = None, message: str = ""
+    ) -> Outcome:
+        """A version with another datum: local items keep their metres, wgs84 items their place on earth."""
+
+        def once(base: Version) -> Outcome:
+            if base.datum == datum:
+                return Outcome("unchanged", base, base.as_dict())
+            prepared = self._store.prepare(base, Changes((), datum, KEEP))
+            text = message or "Set the datum"
+            return self._commit(environment, base, prepared, author, text, (), moved(base, datum), None)
+
+        return self._on_head(environment, None, if_match, once, "its datum can be set")
+
+    def _on_head(
+        self,
+        environment: str,
+        key: Idempotency | None,
+        if_match: str | None,
+        once: Callable[[Version], Outcome],
+        what: str,
+    ) -> Outcome:
+        """A change brought onto the head; again where the head has moved meanwhile and no condition forbids it.
+
+        what: for the message, where the head moves each time. The answer that was given to ``key`` before is repeated.
+        """
         replayed = self._replayed(environment, key)
         if replayed is not None:
             return replayed
         for last in _tries(if_match):
             base = self._store.version(environment)
             check_if_match(if_match, base)
-            target = self._store.version(environment, to)
-            same = target.root == base.root
-            noted = Idempotency(key.key, UNCHANGED + key.fingerprint) if same and key is not None else key
             try:
-                text = message or f"Revert to version {to}"
-                made = self._store.revert(
-                    environment, to, author=author, message=text, expected=base.number, idempotency=noted
-                )
-                return Outcome("unchanged" if same else "created", made, made.as_dict())
+                return once(base)
             except StaleParent:
                 if last:
                     raise
-        raise StaleParent(f"{environment} changes faster than it can be reverted: try again")
-
-    def set_datum(
-        self, environment: str, datum: Datum, *, author: str, if_match: str | None = None, message: str = ""
-    ) -> Outcome:
-        """A version with another datum: local items keep their metres, wgs84 items their place on earth."""
-        for last in _tries(if_match):
-            base = self._store.version(environment)
-            check_if_match(if_match, base)
-            if base.datum == datum:
-                return Outcome("unchanged", base, base.as_dict())
-            prepared = self._store.prepare(base, Changes((), datum, KEEP))
-            try:
-                text = message or "Set the datum"
-                return self._commit(environment, base, prepared, author, text, (), moved(base, datum), None)
-            except StaleParent:
-                if last:
-                    raise
-        raise StaleParent(f"{environment} changes faster than its datum can be set: try again")
+        raise StaleParent(f"{environment} changes faster than {what}: try again")
 
     def _commit(
         self,

@@ -114,8 +114,8 @@ def test_wrong_requests_are_refused_with_what_is_accepted(api: Api, env: str, bo
 
 
 def test_nothing_to_derive_from(api: Api) -> None:
-    api.post("environments", {"name": "bare"})
-    refused = api.post("environments/bare/derivations", {"method": "objects_to_topology"}, expect=None)
+    api.post("environments", {"name": "nothing-there"})
+    refused = api.post("environments/nothing-there/derivations", {"method": "objects_to_topology"}, expect=None)
     assert refused.status_code == 422
     assert "needs objects" in refused.json()["detail"]
 

@@ -171,7 +171,8 @@ def test_coverage_and_formats(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("import", network, "-e", "covered").status == 0
     rows = {row["format"]: row["state"] for row in fleetmap("coverage", "covered", "--json").json}
     assert rows["tmap2"] == "direct"
-    assert rows["occupancy_grid"] == "missing"
+    assert rows["occupancy_grid"] == "derivable"
+    assert rows["satellite"] == "missing"
     told = fleetmap("coverage", "covered").out
     assert "tmap2" in told
     known = {f["id"]: f for f in fleetmap("formats", "--json").json}

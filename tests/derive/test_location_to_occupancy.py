@@ -68,6 +68,9 @@ def test_it_is_the_last_way_to_a_grid() -> None:
     plan = derive.plan(both, frozenset({"occupancy"}))
     assert plan is not None
     assert [s.name for s in plan.steps] == ["objects_to_occupancy"]
-    plan = derive.plan(both, frozenset({"occupancy"}), frozenset({"objects_to_occupancy", "objects_to_voxels"}))
+    others = {n for n, d in derive.all_derivations().items() if d.gives == "occupancy"} - {"location_to_occupancy"}
+    cheapest = {d.cost for n, d in derive.all_derivations().items() if n in others and not d.makes}
+    assert max(cheapest) < derive.all_derivations()["location_to_occupancy"].cost
+    plan = derive.plan(both, frozenset({"occupancy"}), frozenset(others))
     assert plan is not None
     assert plan.steps[-1].name == "location_to_occupancy"
