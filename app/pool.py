@@ -90,6 +90,7 @@ class Pool:
                 ok, value = _ask(worker, function, args, self._seconds if seconds is None else seconds)
                 healthy = True
             finally:
+                healthy = healthy and not self._closed
                 if not healthy:
                     self._end(worker)
                 self._idle.put(worker if healthy else None)
@@ -100,12 +101,22 @@ class Pool:
         return value
 
     def close(self) -> None:
-        """End all workers."""
-        self._closed = True
+        """End all workers.
+
+        A pipe is closed by the thread that holds its worker, here only those of idle ones: closed under another
+        thread's hands, its number could by then belong to another file.
+        """
         with self._lock:
+            self._closed = True
             workers = list(self._workers.values())
         for worker in workers:
-            self._end(worker)
+            worker.process.kill()
+        for _ in range(self._count):
+            with contextlib.suppress(queue.Empty):
+                self._end(self._idle.get_nowait())
+                self._idle.put_nowait(None)  # who waits for a worker wakes up and is told
+        for worker in workers:
+            worker.process.join(5.0)
 
     def _new(self) -> _Worker:
         try:
@@ -124,6 +135,10 @@ class Pool:
         worker = _Worker(process, ours)
         with self._lock:
             self._workers[id(worker)] = worker
+            closed = self._closed
+        if closed:  # close() did not see it
+            self._end(worker)
+            raise Unavailable("the server is stopping")
         return worker
 
     def _end(self, worker: _Worker | None) -> None:
