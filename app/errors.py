@@ -86,6 +86,10 @@ class CannotDerive(CannotConvert):
         return type(self), (self.detail, self.problems, self.step)
 
 
+class CannotGenerate(FleetMapError):
+    """A generator cannot make a site of these parameters; ``detail`` says which to change."""
+
+
 class MissingLayer(CannotConvert):
     """A layer that the format needs neither exists nor can be derived."""
 

@@ -121,6 +121,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("manifest", "What a robot verifies."),
             ("transform", "Between earth and local frame."),
             ("derivations", "What is computed from what, and committing it."),
+            ("generations", "Sites made up from parameters and a seed."),
             ("formats", "What can be read, served and converted."),
             ("jobs", "Work that takes long."),
             ("tokens", "Access."),

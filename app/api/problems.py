@@ -64,6 +64,7 @@ STATUS: Mapping[type[errors.FleetMapError], tuple[int, str]] = {
     errors.UnsafeArchive: (422, "Unsafe archive"),
     WorkerDied: (422, "Processing failed"),
     errors.CannotConvert: (422, "Cannot convert"),
+    errors.CannotGenerate: (422, "Cannot generate"),
     errors.MissingLayer: (422, "Missing layer"),
     errors.MissingDatum: (422, "Missing datum"),
     errors.Ambiguous: (409, "Ambiguous"),

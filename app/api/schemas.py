@@ -218,6 +218,22 @@ class DerivationBody(In):
     replace: bool = Field(False, description="Whether what a source has told, or people have edited, gives way.")
 
 
+class GenerationBody(In):
+    """A site to be made up."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={"examples": [{"generator": "orchard", "seed": 7, "parameters": {"rows": 6}}]},
+    )
+
+    generator: str = Field(max_length=200, description="A generator's name; see `/api/v1/generators`.")
+    seed: int = Field(0, ge=0, le=2**63 - 1, description="The same seed and parameters give the same site again.")
+    parameters: dict[str, Any] = Field(default_factory=dict, description="Of the generator.")
+    message: str = Field("", max_length=MAX_TEXT)
+    replace: bool = Field(False, description="Whether what a source has told, or people have edited, gives way.")
+
+
 class RolloutBody(In):
     """A move in two stages. At least one of ``ready`` and ``failed``."""
 
@@ -615,6 +631,17 @@ class DerivationOut(BaseModel):
     gives: str
     needs: list[str]
     cost: float
+    version: int
+    parameters: list[dict[str, Any]]
+
+
+class GeneratorOut(BaseModel):
+    """A way to make up a site."""
+
+    id: str
+    title: str
+    gives: list[str]
+    needs: list[str] = Field(description="Layers that it works on; without any it makes a whole site.")
     version: int
     parameters: list[dict[str, Any]]
 

@@ -14,7 +14,8 @@ from app.convert import recipe as recipes
 from app.errors import Invalid, MissingLayer, Problem
 from app.formats import Files, Format, Limits
 from app.model.frame import Datum
-from app.model.layers import Layer
+from app.model.layers import Layer, Layers
+from app.store.values import PartEntry, Provenance
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,19 @@ def _made(
     credit = {key: told.credit(key) for key in told.parts}
     layers = told.layers(datum)
     return making.from_layers(known, layers, asked, derived=derived, origin=told.origin, credit=credit)
+
+
+def written(layers: Layers, to: str, options: Mapping[str, str], came: Provenance) -> Converted:
+    """Layers -> files: what the wanted format lacks is derived.
+
+    options: the format's, and those of derivations on the way. came: how the layers came, for the report.
+    """
+    known = formats.get_format(to)
+    recipes.own_options(known, options)
+    entries = {key: PartEntry(key, "", 1, {}, came) for key in layers.parts}
+    made = making.from_layers(known, layers, options, derived=True, entries=entries)
+    left = making.not_carried(known, None, layers)
+    return Converted(made.files, {**made.report, "dropped": made.report["dropped"] + left})
 
 
 def offline_paths(

@@ -5,7 +5,8 @@
 
 from app.ingest.alignment import Alignment
 from app.ingest.derivation import Wish
+from app.ingest.generation import Order
 from app.ingest.online import Provider
 from app.ingest.service import Ingest, Outcome, SpooledFile, Upload
 
-__all__ = ["Alignment", "Ingest", "Outcome", "Provider", "SpooledFile", "Upload", "Wish"]
+__all__ = ["Alignment", "Ingest", "Order", "Outcome", "Provider", "SpooledFile", "Upload", "Wish"]

@@ -106,8 +106,8 @@ class Provenance:
         return any(step.get("step") == EDIT for step in self.steps)
 
     def marked(self) -> Provenance:
-        """After people's changes: what was derived is no longer made anew."""
-        if not self.inputs or self.edited:
+        """After people's changes: what was derived or generated is no longer made anew without a word."""
+        if not (self.inputs or self.information == "generated") or self.edited:
             return self
         return replace(self, steps=(*self.steps, {"step": EDIT}))
 

@@ -1,0 +1,145 @@
+"""``fleetmap generate``: sites made up, on a server or straight into files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app.cli import options, output, write
+from app.cli.client import Client, Refused, path_of
+from app.cli.folder import check_name, environment_name
+from app.cli.history import summary
+from app.cli.maps import show_report
+from app.errors import Invalid
+
+if TYPE_CHECKING:
+    from app.model.frame import Datum
+
+
+def generate(
+    site: Annotated[
+        str | None, typer.Argument(help="The generator, such as orchard or warehouse [default: list them].")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="The same seed gives the same site again.")] = 0,
+    environment: Annotated[
+        str | None, typer.Option("--environment", "-e", help="Where to keep it [default: SITE-SEED, made if absent].")
+    ] = None,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--option", "-O", metavar="NAME=VALUE", help="A parameter of the generator; repeatable."),
+    ] = None,
+    datum: options.DatumText = None,
+    to: Annotated[
+        str | None, typer.Option("--to", help="Write a map in this format instead; needs no server, keeps nothing.")
+    ] = None,
+    out: options.Output = None,
+    message: options.Message = "",
+    replace: Annotated[bool, typer.Option("--replace", help="Also in place of what a source has told.")] = False,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Make up a site: rows, rooms, streets, caves … with all their maps; without a name, list the generators.
+
+    The list and ``--to FORMAT -o FILE`` need no server. With ``--to``, options may also be the format's.
+    """
+    if site is None:
+        _list(as_json=as_json)
+        return
+    values = options.pairs(option)
+    place = options.datum(datum)
+    if to is None:
+        if out is not None:
+            raise typer.BadParameter("-o needs --to FORMAT: name the format of the file")
+        name = environment or environment_name(f"{site}-{seed}")
+        check_name(name)
+        body = {"generator": site, "seed": seed, "parameters": values, "message": message, "replace": replace}
+        with Client(server, token) as client, output.progress_bar(f"generating {site}"):
+            _ensure(client, name, place)
+            made = client.post(path_of("environments", name, "generations"), body, repeat=True)
+        if as_json:
+            output.show_json(made)
+            return
+        output.show(f"{name}: version {made['version']}: {summary(made.get('changes') or {}) or 'nothing new'}")
+        output.show_warnings(made.get("warnings") or ())
+        return
+    if out is None:
+        raise typer.BadParameter("--to needs -o: a file, a folder, or - for standard output")
+    if environment is not None:
+        raise typer.BadParameter("--environment keeps the site on a server, --to writes a file: choose one")
+    if out == "-" and as_json:
+        raise typer.BadParameter("--json and -o - both want standard output")
+    _write(site, seed, values, place, to, out, as_json=as_json)
+
+
+def _list(*, as_json: bool) -> None:
+    from app.generate import all_generators
+
+    known = [one.as_dict() for one in all_generators().values()]
+    if as_json:
+        output.show_json(known)
+        return
+    output.show_table(
+        ("generator", "what it makes", "works on", "gives", "parameters"),
+        [
+            (
+                one["id"],
+                one["title"],
+                ", ".join(one["needs"]) or "nothing",
+                ", ".join(one["gives"]),
+                ", ".join(p["name"] for p in one["parameters"]),
+            )
+            for one in known
+        ],
+    )
+
+
+def _ensure(client: Client, name: str, datum: Datum | None) -> None:
+    """Make sure that the environment is there and has the datum that was asked for."""
+    try:
+        known = client.get(path_of("environments", name))
+    except Refused as refused:
+        if refused.status != 404:
+            raise
+        client.post("/environments", {"name": name, "datum": datum.as_dict() if datum else None})
+        return
+    if datum is not None and (known.get("datum") or {}) != datum.as_dict():
+        client.patch(path_of("environments", name), {"datum": datum.as_dict()})
+
+
+def _write(
+    site: str, seed: int, values: dict[str, str], datum: Datum | None, to: str, out: str, *, as_json: bool
+) -> None:
+    from app import formats, generate, parameters
+    from app.convert import written
+    from app.derive import Notes
+    from app.model.layers import Layers
+    from app.store.values import Provenance
+
+    known = generate.get_generator(site)
+    formats.get_format(to)
+    if known.needs:
+        raise Invalid(
+            f"{site} works on {', '.join(sorted(known.needs))} of an environment: name one with --environment"
+        )
+    ours = {p["name"] for p in parameters.describe(known.parameters)}
+    own = {n: v for n, v in values.items() if n in ours}
+    notes = Notes()
+    with output.progress_bar(f"generating {site}"):
+        made = generate.run(site, seed, own, Layers(datum=datum), notes)
+        came = Provenance("generated", steps=(generate.step(site, seed, own, {}),))
+        result = written(made, to, {n: v for n, v in values.items() if n not in ours}, came)
+    report: dict[str, Any] = {**result.report}
+    report["warnings"] = [w.as_dict() for w in notes.warnings] + report["warnings"]
+    report["dropped"] = notes.dropped + report["dropped"]
+    report["template"] = notes.template + report["template"]
+    as_folder = write.wants_folder(out) or (len(result.files) > 1 and out != "-" and not out.lower().endswith(".zip"))
+    names = write.bundle(result.files, Path(out), folder=as_folder)
+    if as_json:
+        output.show_json({"files": names, "report": report})
+        return
+    for name in names if as_folder else [out] if out != "-" else []:
+        output.say(f"wrote {Path(out) / name if as_folder else name}")
+    show_report(report)

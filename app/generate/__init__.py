@@ -1,0 +1,170 @@
+"""Generators: layers made up from parameters and a seed, for sites that are not mapped yet or do not exist.
+
+A generator is one module with one function under ``@generates``; its parameters are a frozen dataclass. The same seed
+and parameters give the same layers on every machine: all chance comes from ``Source``, and what went through a
+transcendental function is rounded before it is kept.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from app import parameters
+from app.derive import Notes
+from app.errors import CannotGenerate, Invalid, MissingLayer, NotFound, Problem
+from app.model.layers import Layer, Layers, PartKey, is_empty
+
+MAX_SEED = 2**63 - 1
+MAX_CELLS = 2**26
+"""Of a grid that is made up."""
+
+MAX_OBJECTS = 200_000
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where all chance of one generation comes from: streams by name, so that one part's draws shift no other's."""
+
+    seed: int
+    generator: str
+
+    def stream(self, name: str) -> np.random.Generator:
+        """The stream of this name, from its beginning."""
+        digest = hashlib.sha256(f"{self.seed}/{self.generator}/{name}".encode()).digest()
+        return np.random.Generator(np.random.PCG64(int.from_bytes(digest[:16], "little")))
+
+
+Function = Callable[[Layers, Any, Source, Notes], Layers]
+"""(what is there, parameters, chance, notes) -> the new parts. Pure but for the notes.
+
+What is there: the parts of the layers that it needs or looks at, with datum and levels. Parts of the result take the
+place of those with the same key; one that is passed on as it was given is left alone.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Generator:
+    """One way to make layers up. needs: layers that it works on and may replace. also: those that it looks at where
+    they are there (a fence). Without needs it makes a whole site, and takes the place of an earlier made-up one."""
+
+    name: str
+    title: str
+    gives: frozenset[Layer]
+    needs: frozenset[Layer]
+    also: frozenset[Layer]
+    version: int
+    parameters: type[Any]
+    function: Function
+
+    @property
+    def reads(self) -> frozenset[Layer]:
+        """All layers that it looks at."""
+        return self.needs | self.also
+
+    def as_dict(self) -> dict[str, Any]:
+        """The generator as clients see it."""
+        return {
+            "id": self.name,
+            "title": self.title,
+            "gives": sorted(self.gives),
+            "needs": sorted(self.needs),
+            "version": self.version,
+            "parameters": parameters.describe(self.parameters),
+        }
+
+
+_registry: dict[str, Generator] = {}
+
+
+def generates(
+    gives: set[Layer],
+    *,
+    parameters: type[Any],
+    needs: frozenset[Layer] | set[Layer] = frozenset(),
+    also: frozenset[Layer] | set[Layer] = frozenset(),
+    version: int = 1,
+) -> Callable[[Function], Function]:
+    """Declare a function as a generator; its name is its id, its docstring's first line its title."""
+
+    def declare(function: Function) -> Function:
+        name = function.__name__
+        if name in _registry:
+            raise ValueError(f"generator {name} is declared twice")
+        title = (function.__doc__ or name).strip().splitlines()[0]
+        layers = (frozenset(gives), frozenset(needs), frozenset(also))
+        _registry[name] = Generator(name, title, *layers, version, parameters, function)
+        return function
+
+    return declare
+
+
+@cache
+def _discover() -> None:
+    for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
+        if not module.startswith("_"):
+            importlib.import_module(f"{__name__}.{module}")
+
+
+def all_generators() -> Mapping[str, Generator]:
+    """Every generator by name, in alphabetical order."""
+    _discover()
+    return dict(sorted(_registry.items()))
+
+
+def get_generator(name: str) -> Generator:
+    """NotFound, with the known ones, for a name that is none."""
+    known = all_generators().get(name)
+    if known is None:
+        raise NotFound(f"there is no generator {name!r}; known ones: {', '.join(all_generators())}")
+    return known
+
+
+def check(name: str, seed: int, values: Mapping[str, Any]) -> tuple[Generator, Any]:
+    """The generator and its parameters, before any work. NotFound, or Invalid with each wrong value."""
+    known = get_generator(name)
+    if not 0 <= seed <= MAX_SEED:
+        problem = f"must be from 0 to {MAX_SEED}, got {seed}"
+        raise Invalid(f"seed: {problem}", [Problem(problem, where="seed")])
+    return known, parameters.parse(known.parameters, values, f"parameter of {name}")
+
+
+def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: Notes) -> Layers:
+    """What the generator makes: only new parts, with the datum and the levels of the whole.
+
+    Raises NotFound, Invalid, MissingLayer (with what it works on), CannotGenerate.
+    """
+    known, options = check(name, seed, values)
+    lacking = known.needs - given.layers
+    if lacking:
+        raise MissingLayer(
+            f"{name} works on {', '.join(sorted(lacking))}, and there is none: upload a map or generate one first"
+        )
+    made = known.function(given, options, Source(seed, name), notes)
+    fresh = {k: p for k, p in made.parts.items() if given.parts.get(k) is not p and not is_empty(p)}
+    if not fresh:
+        raise CannotGenerate(f"{name} made nothing with these parameters")
+    unknown = {k.layer for k in fresh} - known.gives
+    if unknown:
+        raise ValueError(f"{name} made {', '.join(sorted(unknown))} and does not declare it")
+    return Layers(fresh, given.datum or made.datum, made.levels)
+
+
+def step(name: str, seed: int, values: Mapping[str, Any], used: Mapping[PartKey, str]) -> dict[str, Any]:
+    """How it was made, for provenance: enough to make it again. used: hashes of the parts that it was given."""
+    known, options = check(name, seed, values)
+    defaults = {p["name"]: p["default"] for p in parameters.describe(known.parameters)}
+    members: dict[str, Any] = {"step": name, "seed": seed, "version": known.version}
+    members["parameters"] = {**defaults, **parameters.canonical(options)}
+    if used:
+        members["given"] = [
+            {"layer": k.layer, "level": k.level, "name": k.name, "hash": digest} for k, digest in sorted(used.items())
+        ]
+    return members

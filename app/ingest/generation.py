@@ -1,0 +1,74 @@
+"""A site made up and committed: a version whose provenance says by which generator, seed and parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from app import generate
+from app.derive import Notes
+from app.errors import Conflict, Problem
+from app.ingest.prepare import open_store
+from app.model.layers import Layers, PartKey
+from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Replace
+from app.store.values import PartEntry, Version
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What is to be made up. replace: also in place of what a source has told or people have edited."""
+
+    generator: str
+    seed: int
+    values: Mapping[str, Any]
+    replace: bool = False
+
+
+def prepare_generation(
+    database_url: str, blob_dir: str, base: Version, order: Order
+) -> tuple[Prepared, tuple[Problem, ...]]:
+    """In a worker: carry out a generation on a version.
+
+    What a whole site's generator made here before goes where the new site has no such part. Raises MissingLayer,
+    CannotGenerate, Conflict (a source has told that part).
+    """
+    store = open_store(database_url, blob_dir)
+    known, _ = generate.check(order.generator, order.seed, order.values)
+    used = {e.key: e for e in base.parts if e.count > 0 and e.key.layer in known.reads}
+    loaded = store.load(base, sorted(used))
+    given = Layers(loaded.parts, base.datum, base.levels)
+    notes = Notes()
+    made = generate.run(order.generator, order.seed, order.values, given, notes)
+    own = {e.key: e for e in base.parts if e.count > 0}
+    _check_free(order, known, made, own)
+    credit = tuple(dict.fromkeys(text for k in sorted(used) for text in used[k].provenance.attribution))
+    how = generate.step(order.generator, order.seed, order.values, {k: e.hash for k, e in used.items()})
+    sources = tuple(sorted({s for e in used.values() for s in e.provenance.sources}))
+    provenance = Provenance("generated", None, sources, None, (how,), credit)
+    operations: list[Operation] = [Replace(key, part, provenance) for key, part in sorted(made.parts.items())]
+    if not known.needs:
+        operations += [Drop(key) for key in sorted(own) if key not in made.parts and _made_up(own[key])]
+    datum = made.datum if made.datum != base.datum else KEEP
+    levels = made.levels if made.levels != base.levels else KEEP
+    told = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
+    told += [Problem(f"filled in: {t['what']} = {t['value']}: {t['why']}") for t in notes.template]
+    return store.prepare(base, Changes(tuple(operations), datum, levels)), (*notes.warnings, *told)
+
+
+def _made_up(entry: PartEntry) -> bool:
+    """Whether it is a generator's work and nobody's since."""
+    return entry.provenance.information == "generated" and not entry.provenance.edited
+
+
+def _check_free(order: Order, known: generate.Generator, made: Layers, own: Mapping[PartKey, PartEntry]) -> None:
+    """A generator may replace what it was made to work on, and its like's work; the rest only where asked."""
+    for key in sorted(made.parts):
+        entry = own.get(key)
+        if entry is None or order.replace or key.layer in known.needs or _made_up(entry):
+            continue
+        edited, kind = entry.provenance.edited, entry.provenance.information
+        why = f"was {kind} and then edited" if edited else f"is {kind}"
+        raise Conflict(
+            f"the {key.layer} {key.level}/{key.name} {why}: to put a made-up one in its place, ask with replace=true"
+        )
