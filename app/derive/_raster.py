@@ -279,20 +279,28 @@ def areas(polygons: Iterable[object], frame: Frame, *, touched: bool) -> Iterato
         length = np.linalg.norm(step, axis=1)
         left = np.column_stack([-step[:, 1], step[:, 0]])
         left = np.divide(left, length[:, None], out=np.zeros_like(left), where=length[:, None] > 0)
-        yield from _lines(edges + INWARDS * left[:, None, :], frame)
+        yield from _in_one(lines(edges + INWARDS * left[:, None, :], frame))
     others = parts[~flat]
-    lines, _ = _edges(others[np.isin(shapely.get_type_id(others), (1, 2))])
-    yield from _lines(lines, frame)
+    straight, _ = _edges(others[np.isin(shapely.get_type_id(others), (1, 2))])
+    yield from _in_one(lines(straight, frame))
     at = shapely.get_coordinates(others[shapely.get_type_id(others) == 0])
-    yield from _lines(np.stack([at, at], axis=1), frame)
+    yield from _in_one(lines(np.stack([at, at], axis=1), frame))
 
 
-def _lines(edges: Array, frame: Frame) -> Iterator[Spans]:
+def _in_one(parts: Iterable[Spans]) -> Iterator[Spans]:
+    """The spans, all in the layer 0."""
+    for spans in parts:
+        spans[:, 0] = 0
+        yield spans
+
+
+def lines(edges: Array, frame: Frame) -> Iterator[Spans]:
+    """The cells that straight lines (float64 [n, 2, 2], metres) touch; a line's number is the spans' layer."""
     if len(edges):
         xy = frame.of(edges)
         aside = (xy.max(axis=1) < 0).any(axis=1) | (xy.min(axis=1) > [frame.width, frame.height]).any(axis=1)
-        xy = xy[~aside]
-        yield from _touched(xy, np.arange(len(xy)), np.zeros(len(xy), np.int64), frame)
+        there = np.flatnonzero(~aside)
+        yield from _touched(xy[there], np.arange(len(there)), there, frame)
 
 
 def _edges(lines: NDArray[np.object_]) -> tuple[Array, NDArray[np.int64]]:

@@ -50,6 +50,7 @@ from app.formats._text import DEGREES, number
 from app.model import solids, worlds
 from app.model.features import Feature, Features, features, unique_ids
 from app.model.frame import GROUND, Datum, is_writable
+from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, PartKey, Resources
 from app.parameters import parameter
 
@@ -543,6 +544,9 @@ class _Writer:
             self.context.drop("objects of other formats", sum(len(p) for _, p in self.others), why)
         bodies.report()
         for key, grid in self.layers.grids().items():
+            told = any(other.level == key.level for other, _ in self.others)
+            if self.options.grid is None and everything and told and _is_slice(grid):
+                continue  # its walls are these objects
             if everything or self.options.grid is not None:
                 name = _sdf_bodies.free_name(f"walls_{_sdf_bodies.slug(key.name)}", self.taken)
                 made = bodies.walls(grid, name, self.options.threshold, self.layers.elevation(key.level))
@@ -704,6 +708,12 @@ def _natural(text: str) -> tuple[tuple[int, str], ...]:
             word += letter
     out.append((len(digits), digits) if digits else (0, word))
     return tuple(out)
+
+
+def _is_slice(grid: OccupancyGrid) -> bool:
+    """Whether a grid was made of the objects beside it (``app.generate``)."""
+    said = grid.properties.get("slice")
+    return isinstance(said, Mapping) and said.get("of") == "objects"
 
 
 def _is_pose(value: Any) -> bool:

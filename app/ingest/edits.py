@@ -396,7 +396,9 @@ class _Session:
             raise Invalid(f"the polygon covers no cell centre of grid {key.name}")
         cells = grid.cells.copy()
         cells[mask] = value
-        self._grids[key] = replace(grid, cells=cells)
+        # Once people have drawn in it, a grid tells more than the objects that it was a slice of.
+        said = {word: value for word, value in grid.properties.items() if word != "slice"}
+        self._grids[key] = replace(grid, cells=cells, properties=said)
 
     def _grid_key(self, change: Mapping[str, Any]) -> PartKey:
         name, level = change.get("grid"), change.get("level")

@@ -30,12 +30,15 @@ def prepare_generation(
 ) -> tuple[Prepared, tuple[Problem, ...]]:
     """In a worker: carry out a generation on a version.
 
-    What a whole site's generator made here before goes where the new site has no such part. Raises MissingLayer,
-    CannotGenerate, Conflict (a source has told that part).
+    What a whole site's generator made here before goes where the new site has no such part, and is not looked at: the
+    fence of the last site does not bind the next one. Raises MissingLayer, CannotGenerate, Conflict (a source has told
+    that part).
     """
     store = open_store(database_url, blob_dir)
     known, _ = generate.check(order.generator, order.seed, order.values)
     used = {e.key: e for e in base.parts if e.count > 0 and e.key.layer in known.reads}
+    if not known.needs:
+        used = {k: e for k, e in used.items() if not _made_up(e)}
     loaded = store.load(base, sorted(used))
     given = Layers(loaded.parts, base.datum, base.levels)
     notes = Notes()

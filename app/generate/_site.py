@@ -1,0 +1,585 @@
+"""What all sites share: from a fence, solids, marks and a network to layers that agree with each other.
+
+A generator puts objects with their solids, nodes, edges, zones and coloured ground into a ``Site``; ``finish`` makes of
+it the location, the objects, the grid (the slice of these very solids), the network, the zones and a picture seen from
+above, and refuses what does not fit together. Metres of the local frame everywhere; heights too are those of the local
+frame, so what stands on a level begins at that level's elevation.
+
+Numbers that are kept are whole millimetres and microradians: the last bit of a sine differs between machines.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import Notes, _raster
+from app.derive._obstacles import fences
+from app.derive._raster import Frame
+from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
+from app.errors import CannotConvert, CannotGenerate, Invalid, Problem
+from app.generate import MAX_CELLS, MAX_OBJECTS
+from app.model.features import Properties, features
+from app.model.frame import GROUND, Datum, Level
+from app.model.grid import FREE, UNKNOWN, OccupancyGrid
+from app.model.imagery import Picture
+from app.model.layers import MAP, NETWORK, SITE, ZONES, Layers, Part, PartKey, Resources
+from app.parameters import parameter
+
+Array = NDArray[np.float64]
+
+NAME = "generated"
+"""The family of the objects and files of a site."""
+
+PICTURE = "satellite"
+
+DATUM = Datum(latitude=52.4205, longitude=5.6132)
+"""Where a site lies when nobody says so: farmland in Flevoland, the Netherlands."""
+
+HEIGHT = 0.2
+RESOLUTIONS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+EASY = 2**22
+"""Cells of a grid, and pixels of a picture, up to which the finest of these is taken unless asked otherwise."""
+
+WIDEST = 20.0
+"""Metres of free width beyond which an edge is not looked at."""
+
+MOST_NODES = 20_000
+
+COLOURS: Mapping[str, tuple[int, int, int]] = {
+    "grass": (120, 146, 84),
+    "meadow": (134, 158, 96),
+    "soil": (140, 112, 82),
+    "tilled": (126, 98, 70),
+    "path": (186, 170, 138),
+    "gravel": (172, 166, 156),
+    "asphalt": (92, 92, 94),
+    "concrete": (188, 186, 180),
+    "paving": (170, 158, 146),
+    "floor": (206, 202, 194),
+    "marking": (226, 190, 60),
+    "white": (232, 232, 228),
+    "wall": (112, 108, 104),
+    "roof": (150, 84, 66),
+    "roof_dark": (98, 90, 88),
+    "roof_light": (196, 192, 186),
+    "crown": (58, 94, 46),
+    "crown_light": (74, 112, 54),
+    "crown_dark": (46, 80, 40),
+    "leaf": (86, 128, 58),
+    "straw": (204, 184, 120),
+    "wood": (138, 104, 66),
+    "metal": (150, 154, 160),
+    "plastic": (214, 222, 224),
+    "shelf": (60, 92, 140),
+    "goods": (178, 140, 92),
+    "charger": (66, 150, 110),
+    "water": (82, 122, 150),
+    "furniture": (150, 120, 92),
+}
+"""What a picture is painted with: red, green, blue."""
+
+_NUMBER = {name: k for k, name in enumerate(COLOURS)}
+
+
+@dataclass(frozen=True, slots=True)
+class SiteOptions:
+    """Parameters that every site has."""
+
+    datum: tuple[float, float] | None = parameter(
+        None,
+        f"latitude,longitude of the origin; default: the environment's, else {DATUM.latitude:g},{DATUM.longitude:g}",
+        minimum=-180.0,
+        maximum=180.0,
+        unit="°",
+    )
+    robot_radius: float = parameter(
+        0.3, "of the largest robot: no edge comes nearer to an obstacle", minimum=0.05, maximum=5.0, unit="m"
+    )
+    height: float = parameter(
+        HEIGHT,
+        "height above the floor at which the grid is the slice of the world",
+        minimum=0.01,
+        maximum=3.0,
+        unit="m",
+    )
+    resolution: float | None = parameter(
+        None,
+        f"metres a cell; default: {RESOLUTIONS[0]}, or as much coarser as keeps a grid below 2^22 cells",
+        minimum=0.01,
+        maximum=2.0,
+        unit="m",
+    )
+
+
+def mm(value: float) -> float:
+    """A coordinate or length in whole millimetres."""
+    return round(float(value), 3) + 0.0
+
+
+def angle(value: float) -> float:
+    """An angle in whole microradians, from -π to π."""
+    return round(math.remainder(float(value), 2 * math.pi), 6) + 0.0
+
+
+def rounded(geometry: Any) -> Any:
+    """A geometry in whole millimetres."""
+    return shapely.transform(geometry, lambda xy: np.round(xy, 3) + 0.0)
+
+
+def rectangle(x: float, y: float, yaw: float, length: float, width: float) -> Any:
+    """A polygon around a middle, its length along the yaw."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    corners = [(u * length / 2, v * width / 2) for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    return rounded(shapely.Polygon([(x + c * u - s * v, y + s * u + c * v) for u, v in corners]))
+
+
+def disc(x: float, y: float, radius: float) -> Any:
+    """A polygon of 16 sides around a middle."""
+    return rounded(shapely.Point(x, y).buffer(radius, quad_segs=4))
+
+
+def orientation(yaw: float) -> list[float]:
+    """The quaternion [x, y, z, w] of a yaw."""
+    return [0.0, 0.0, round(math.sin(yaw / 2), 6) + 0.0, round(math.cos(yaw / 2), 6) + 0.0]
+
+
+def refused(where: str, problem: str) -> CannotGenerate:
+    """The error for one parameter."""
+    return CannotGenerate(f"{where}: {problem}", [Problem(problem, where=where)])
+
+
+class Site:
+    """A site on its way to layers.
+
+    datum: where it lies. fence: the polygon within which it lies (metres), the environment's or the generator's own;
+    is_given tells which, once ``bounded`` was called.
+    """
+
+    def __init__(
+        self, given: Layers, options: SiteOptions, notes: Notes, *, levels: Sequence[Level] = (Level(),)
+    ) -> None:
+        self.given, self.options, self.notes, self.levels = given, options, notes, tuple(levels)
+        self.datum = _datum(given, options, notes)
+        self.fence: Any = None
+        self.is_given = False
+        self.files: dict[str, bytes] = {}
+        self._objects: dict[str, list[tuple[str, Any, Properties]]] = {}
+        self._zones: dict[str, list[tuple[str, Any, Properties]]] = {}
+        self._nodes: dict[str, tuple[str, tuple[float, float], dict[str, Any]]] = {}
+        self._edges: dict[str, tuple[str, str, Any, dict[str, Any]]] = {}
+        self._ground: dict[str, list[tuple[int, list[Any]]]] = {}
+        self._bodies: dict[str, list[tuple[int, list[Any]]]] = {}
+        self._base: dict[str, str] = {}
+        self._count = 0
+
+    # --- the ground --------------------------------------------------------------------------------------------------
+
+    def bounded(self, own: Any) -> Any:
+        """The fence: the environment's where it has one (the largest of several polygons), else ``own``.
+
+        own: a polygon in metres. Raises CannotGenerate where a grid of it would be too large.
+        """
+        known = fences(self.given, self.notes).get(GROUND)
+        if known is not None:
+            pieces = [p for p in shapely.get_parts(known) if p.geom_type == "Polygon"]
+            pieces.sort(key=lambda p: (-p.area, *p.bounds))
+            if len(pieces) > 1:
+                self.notes.drop("polygons of the fence", len(pieces) - 1, "the site lies in the largest one")
+            self.fence, self.is_given = shapely.Polygon(pieces[0].exterior), True
+            if pieces[0].interiors:
+                self.notes.drop("holes of the fence", len(pieces[0].interiors), "a fence is one ring")
+        else:
+            self.fence = shapely.orient_polygons(rounded(own))
+        self._resolution()
+        return self.fence
+
+    def _resolution(self) -> float:
+        """Metres a cell. CannotGenerate where there would be too many cells."""
+        box = self.fence.bounds
+        fine = (r for r in RESOLUTIONS if _cells(box, r) <= EASY)
+        asked = self.options.resolution or next(fine, RESOLUTIONS[-1])
+        if _cells(box, asked) * len(self.levels) > MAX_CELLS:
+            side = f"{box[2] - box[0]:.0f} × {box[3] - box[1]:.0f} m"
+            raise refused(
+                "resolution",
+                f"{side} on {len(self.levels)} levels would be more than {MAX_CELLS} cells of {asked:g} m: ask for a "
+                "coarser resolution or a smaller site",
+            )
+        return asked
+
+    def draw(self, shape: Any, colour: str, *, level: str = GROUND) -> None:
+        """Paint ground on the picture, over what is there already. shape: polygons or lines."""
+        self._ground.setdefault(level, []).append((_NUMBER[colour], _listed(shape)))
+
+    # --- what stands there -------------------------------------------------------------------------------------------
+
+    def put(
+        self,
+        i: str,
+        kind: str,
+        geometry: Any,
+        *,
+        shapes: Sequence[Mapping[str, Any]] = (),
+        pose: Sequence[float] | None = None,
+        level: str = GROUND,
+        colour: str | None = None,
+        seen: Any = None,
+        **words: Any,
+    ) -> None:
+        """An object. shapes: its solids (``app.model.solids``), in the frame of its pose (x, y, z, yaw).
+
+        colour: of its geometry in the picture, or of ``seen`` where that is another one (a crown over a trunk).
+        """
+        self._count += 1
+        if self._count > MAX_OBJECTS:
+            raise CannotGenerate(f"the site has more than {MAX_OBJECTS} objects: make it smaller")
+        said: dict[str, Any] = {"kind": kind, **words}
+        if pose is not None:
+            x, y, z, yaw = pose
+            said["pose"] = [mm(x), mm(y), mm(z), 0.0, 0.0, angle(yaw)]
+        if shapes:
+            said["shapes"] = [_plain(shape) for shape in shapes]
+        self._objects.setdefault(level, []).append((i, rounded(geometry), said))
+        if colour is not None:
+            shape = geometry if seen is None else seen
+            self._bodies.setdefault(level, []).append((_NUMBER[colour], _listed(shape)))
+
+    def box(
+        self,
+        i: str,
+        kind: str,
+        at: Sequence[float],
+        size: Sequence[float],
+        *,
+        yaw: float = 0.0,
+        base: float = 0.0,
+        level: str = GROUND,
+        **words: Any,
+    ) -> None:
+        """A box on the ground: at (x, y) its middle, size (x, y, z), base metres above the level's floor."""
+        x, y, z = (mm(v) for v in size)
+        shape: dict[str, Any] = {"type": "box", "size": [x, y, z], "pose": [0.0, 0.0, mm(z / 2), 0.0, 0.0, 0.0]}
+        self.put(
+            i,
+            kind,
+            rectangle(at[0], at[1], yaw, x, y),
+            shapes=[shape],
+            pose=(at[0], at[1], self.elevation(level) + base, yaw),
+            level=level,
+            size=[x, y, z],
+            **words,
+        )
+
+    def post(
+        self,
+        i: str,
+        kind: str,
+        at: Sequence[float],
+        radius: float,
+        height: float,
+        *,
+        level: str = GROUND,
+        **words: Any,
+    ) -> None:
+        """An upright cylinder on the ground at (x, y)."""
+        r, h = mm(radius), mm(height)
+        shape = {"type": "cylinder", "radius": r, "length": h, "pose": [0.0, 0.0, mm(h / 2), 0.0, 0.0, 0.0]}
+        point = shapely.Point(at[0], at[1])
+        pose = (at[0], at[1], self.elevation(level), 0.0)
+        words = {"seen": disc(at[0], at[1], radius), "width": mm(2 * r), "height": h, **words}
+        self.put(i, kind, point, shapes=[shape], pose=pose, level=level, **words)
+
+    def mark(self, i: str, kind: str, geometry: Any, *, level: str = GROUND, **words: Any) -> None:
+        """Something without a body: a region, a point of interest."""
+        self.put(i, kind, geometry, level=level, **words)
+
+    def zone(self, i: str, kind: str, polygon: Any, *, level: str = GROUND, **words: Any) -> None:
+        """A zone: keepout, speed …"""
+        self._zones.setdefault(level, []).append((i, rounded(polygon), {"kind": kind, **words}))
+
+    def elevation(self, level: str) -> float:
+        """Metres of a level's floor."""
+        return next(known.elevation for known in self.levels if known.name == level)
+
+    # --- the network -------------------------------------------------------------------------------------------------
+
+    def node(self, name: str, at: Sequence[float], *, yaw: float = 0.0, level: str = GROUND, **words: Any) -> str:
+        """A node under its name, which is its id."""
+        if name in self._nodes or name in self._edges:
+            raise ValueError(f"two nodes are called {name}")
+        if len(self._nodes) >= MOST_NODES:
+            raise CannotGenerate(f"the network has more than {MOST_NODES} nodes: make the site smaller")
+        said = {"kind": "node", "name": name, "orientation": orientation(yaw), **words}
+        self._nodes[name] = (level, (mm(at[0]), mm(at[1])), said)
+        return name
+
+    def way(
+        self,
+        a: str,
+        b: str,
+        *,
+        action: str = "move_base",
+        speed: float | None = None,
+        both: bool = True,
+        bends: Sequence[Sequence[float]] = (),
+        **words: Any,
+    ) -> None:
+        """An edge from a to b, and one back; bends: points between. Where the levels differ it is a lift or stairs,
+        and no grid is asked."""
+        at = [self._nodes[a][1], *((mm(x), mm(y)) for x, y in bends), self._nodes[b][1]]
+        for source, target, line in ((a, b, at), (b, a, at[::-1])) if both else ((a, b, at),):
+            i = f"{source}_{target}"
+            if i in self._edges or i in self._nodes:
+                raise ValueError(f"two edges are called {i}")
+            said: dict[str, Any] = {"kind": "edge", "source": source, "target": target, "action": action, **words}
+            if speed is not None:
+                said["speed_limit"] = speed
+            self._edges[i] = (source, target, shapely.LineString(line), said)
+
+    def position(self, name: str) -> tuple[float, float]:
+        """Where a node stands."""
+        return self._nodes[name][1]
+
+    # --- all of it together ------------------------------------------------------------------------------------------
+
+    def finish(self, *, ground: str = "grass") -> Layers:
+        """The layers. ground: colour of what nothing was painted on.
+
+        Raises CannotGenerate where nothing stands in a robot's way at the height of the slice. An edge that no robot
+        can take, or a node that cannot be reached, is a mistake of the generator: RuntimeError.
+        """
+        if self.fence is None:
+            raise ValueError("bounded() was not called")
+        parts: dict[PartKey, Part] = {k: p for k, p in self.given.parts.items() if k.layer == "location"}
+        if not self.is_given:
+            ring = [("fence", self.fence, {"kind": "fence"})]
+            parts[PartKey("location", GROUND, SITE)] = features(ring, "local")
+        for level, rows in self._objects.items():
+            parts[PartKey("objects", level, NAME)] = features(rows, "local")
+        if self.files:
+            parts[PartKey("resources", GROUND, NAME)] = Resources(dict(sorted(self.files.items())))
+        grids = self._grids(parts)
+        parts.update(grids)
+        self._checked_zones()
+        for level, rows in self._zones.items():
+            parts[PartKey("zones", level, ZONES)] = features(rows, "local")
+        widths = self._checked(grids)
+        for level in {level for level, _, _ in self._nodes.values()}:
+            nodes = [(i, shapely.Point(at), said) for i, (where, at, said) in self._nodes.items() if where == level]
+            edges = [
+                (i, line, {**said, **({"width": widths[i]} if i in widths else {})})
+                for i, (a, _, line, said) in self._edges.items()
+                if self._nodes[a][0] == level
+            ]
+            parts[PartKey("topology", level, NETWORK)] = features([*nodes, *edges], "local")
+        for level in (level.name for level in self.levels):
+            parts[PartKey("imagery", level, PICTURE)] = self._picture(level, ground)
+        return Layers(dict(sorted(parts.items())), self.datum, self.levels)
+
+    def _grids(self, parts: Mapping[PartKey, Part]) -> dict[PartKey, Part]:
+        """The slice of the objects on each level, of which one connected piece stays free."""
+        resolution = self._resolution()
+        if self.options.resolution is None and resolution != RESOLUTIONS[0]:
+            why = f"{RESOLUTIONS[0]} m would be more than {EASY} cells"
+            self.notes.fill("resolution", resolution, why)
+        asked = Parameters(height=self.options.height, resolution=resolution)
+        own = Notes()
+        known = {k: p for k, p in parts.items() if k.layer != "location"}
+        known[PartKey("location", GROUND, SITE)] = features([("fence", self.fence, {"kind": "fence"})], "local")
+        try:
+            made = objects_to_occupancy(Layers(known, self.datum, self.levels), asked, own)
+        except CannotConvert as error:
+            raise CannotGenerate(error.detail, error.problems) from error
+        self.notes.warnings += own.warnings
+        out: dict[PartKey, Part] = {}
+        for key, grid in made.grids().items():
+            cells, closed = connected(grid.cells)
+            if closed:
+                area = round(closed * grid.resolution**2, 2)
+                self.notes.drop(
+                    "free cells", closed, f"{area:g} m² that no way leads to count as unknown on {key.level}"
+                )
+            said = {"slice": {"of": "objects", "height": self.options.height}}
+            out[PartKey("occupancy", key.level, MAP)] = OccupancyGrid(
+                cells, grid.resolution, grid.origin, properties=said
+            )
+        return out
+
+    def _checked_zones(self) -> None:
+        """No edge leads through a keep-out zone."""
+        for level, rows in self._zones.items():
+            shut = [polygon for _, polygon, said in rows if said["kind"] == "keepout"]
+            here = [(i, e[2]) for i, e in self._edges.items() if self._nodes[e[0]][0] == level]
+            if shut and here:
+                lines = np.array([line for _, line in here], object)
+                hits = shapely.STRtree(lines).query(np.array(shut, object), predicate="intersects")[1]
+                if len(hits):
+                    raise RuntimeError(f"the edge {here[int(hits[0])][0]} leads through a keep-out zone")
+
+    def _checked(self, grids: Mapping[PartKey, Part]) -> dict[str, float]:
+        """Metres of free width of each edge. RuntimeError where a robot cannot take one, or come to a node."""
+        ways = [(a, b) for a, b, _, _ in self._edges.values()]
+        for start, directed in ((0, ways), (1, [(b, a) for a, b in ways])):
+            lost = _unreached(list(self._nodes), directed)
+            if lost:
+                way = "to" if start == 0 else "from"
+                raise RuntimeError(f"no way leads {way} {len(lost)} of the nodes, as {', '.join(lost[:5])}")
+        out: dict[str, float] = {}
+        for key, grid in grids.items():
+            if not isinstance(grid, OccupancyGrid):
+                continue
+            here = [i for i, e in self._edges.items() if {self._nodes[n][0] for n in e[:2]} == {key.level}]
+            lines = [self._edges[i][2] for i in here]
+            stands = [shapely.Point(at) for level, at, _ in self._nodes.values() if level == key.level]
+            good = passable(grid, [*lines, *stands], self.options.robot_radius)
+            if not good.all():
+                k = int(np.flatnonzero(~good)[0])
+                what = f"the edge {here[k]}" if k < len(here) else "a node"
+                raise RuntimeError(f"{what} is nearer to an obstacle than {self.options.robot_radius:g} m")
+            out |= dict(zip(here, clearance(grid, lines).tolist(), strict=True))
+        return out
+
+    def _picture(self, level: str, ground: str) -> Picture:
+        """The level from above."""
+        box = self.fence.bounds
+        resolution = next((r for r in RESOLUTIONS if _cells(box, r) <= EASY), RESOLUTIONS[-1])
+        frame = Frame.around(box, resolution)
+        index = np.full((frame.height, frame.width), _NUMBER[ground], np.uint8)
+        for rows in (self._ground.get(level, []), self._bodies.get(level, [])):
+            for number, shapes in _runs(rows):
+                _raster.paint(index, _raster.areas(shapes, frame, touched=False), number)
+        table = np.array(list(COLOURS.values()), np.uint8)
+        left, bottom = frame.origin
+        top = round(bottom + frame.height * resolution, 9)
+        return Picture(table[index[::-1]], (resolution, 0.0, left, 0.0, -resolution, top))
+
+
+# --- the grid ---------------------------------------------------------------------------------------------------------
+
+
+def connected(cells: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], int]:
+    """Cells of which only the largest piece of free ones (joined by their sides) is free, the others unknown; and how
+    many these were."""
+    import cv2
+
+    free = cells == FREE
+    count, label, stats, _ = cv2.connectedComponentsWithStats(free.astype(np.uint8), connectivity=4)
+    if count <= 2:
+        return cells, 0
+    largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    shut = free & (label != largest)
+    out = cells.copy()
+    out[shut] = UNKNOWN
+    return out, int(np.count_nonzero(shut))
+
+
+def passable(grid: OccupancyGrid, lines: Sequence[Any], radius: float) -> NDArray[np.bool_]:
+    """Which lines and points (metres) a robot of a radius can take: bool [n].
+
+    Every cell that it touches lies in the grid, and farther than the radius from any that is not free, middle to
+    middle: it is outside of the inflated obstacles. The grid's yaw is 0.
+    """
+    import cv2
+
+    blocked = np.pad(grid.cells != FREE, 1, constant_values=True)
+    away = cv2.distanceTransform((~blocked).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    frame = Frame((grid.origin[0], grid.origin[1]), grid.resolution, grid.width, grid.height)
+    at, owner = shapely.get_coordinates(np.array(lines, object), return_index=True)
+    cells = frame.of(at)
+    good = np.ones(len(lines), bool)
+    outside = ((cells < 0) | (cells > [grid.width, grid.height])).any(axis=1)
+    good[owner[outside]] = False
+    # Consecutive vertices, and each vertex with itself, so that points count too.
+    same = owner[1:] == owner[:-1]
+    edges = np.concatenate([np.stack([at[:-1], at[1:]], axis=1)[same], np.stack([at, at], axis=1)])
+    number = np.concatenate([owner[:-1][same], owner])
+    for spans in _raster.lines(edges, frame):
+        which, row, column = _raster.expanded(spans)
+        near = away[row, column] <= radius / grid.resolution + 1e-4
+        good[number[which[near]]] = False
+    return good
+
+
+def clearance(grid: OccupancyGrid, lines: Sequence[Any]) -> Array:
+    """Metres of free width along lines: twice the distance to the nearest cell that is not free, at most WIDEST,
+    rounded down to centimetres: float64 [n]."""
+    out = np.full(len(lines), WIDEST)
+    if not len(lines):
+        return out
+    blocked = np.pad(grid.cells != FREE, 1, constant_values=True)
+    rim = blocked.copy()
+    rim[1:-1, 1:-1] &= ~(blocked[:-2, 1:-1] & blocked[2:, 1:-1] & blocked[1:-1, :-2] & blocked[1:-1, 2:])
+    step = np.diff(np.pad(rim, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    (row, first), (_, end) = np.nonzero(step == 1), np.nonzero(step == -1)
+    x, y, r = grid.origin[0], grid.origin[1], grid.resolution
+    boxes = shapely.box(x + (first - 1) * r, y + (row - 1) * r, x + (end - 1) * r, y + row * r)
+    given = np.array(lines, object)
+    found, distance = shapely.STRtree(boxes).query_nearest(
+        given, max_distance=WIDEST / 2, return_distance=True, all_matches=False
+    )
+    out[found[0]] = np.floor(np.round(2 * distance, 6) * 100) / 100
+    return np.asarray(np.minimum(out, WIDEST), np.float64)
+
+
+def _cells(box: Sequence[float], resolution: float) -> float:
+    return (box[2] - box[0] + resolution) * (box[3] - box[1] + resolution) / resolution**2
+
+
+# --- small things -----------------------------------------------------------------------------------------------------
+
+
+def _datum(given: Layers, options: SiteOptions, notes: Notes) -> Datum:
+    """The environment's datum, else the one asked for, else DATUM."""
+    asked = None if options.datum is None else Datum(options.datum[0], options.datum[1])
+    if given.datum is not None:
+        if asked is not None and (asked.latitude, asked.longitude) != (given.datum.latitude, given.datum.longitude):
+            reason = "the environment has a datum already: leave this out, or change the datum with PATCH"
+            raise Invalid(f"datum: {reason}", [Problem(reason, where="datum")])
+        return given.datum
+    if asked is None:
+        notes.fill("datum", DATUM.as_dict(), "neither the environment nor the parameter datum says where the site is")
+    return asked or DATUM
+
+
+def _unreached(names: Sequence[str], ways: Iterable[tuple[str, str]]) -> list[str]:
+    """The nodes to which no way leads from the first one."""
+    following: dict[str, list[str]] = {name: [] for name in names}
+    for a, b in ways:
+        following[a].append(b)
+    seen, waiting = set(names[:1]), list(names[:1])
+    while waiting:
+        for name in following[waiting.pop()]:
+            if name not in seen:
+                seen.add(name)
+                waiting.append(name)
+    return [name for name in names if name not in seen]
+
+
+def _listed(shape: Any) -> list[Any]:
+    return list(shape) if isinstance(shape, (list, tuple, np.ndarray)) else [shape]
+
+
+def _plain(shape: Mapping[str, Any]) -> dict[str, Any]:
+    """A shape without a pose that says nothing."""
+    return {key: value for key, value in shape.items() if key != "pose" or any(value)}
+
+
+def _runs(rows: Iterable[tuple[int, list[Any]]]) -> Iterable[tuple[int, list[Any]]]:
+    """Consecutive shapes of one colour together."""
+    current: tuple[int, list[Any]] | None = None
+    for number, shapes in rows:
+        if current is not None and current[0] == number:
+            current[1].extend(shapes)
+            continue
+        if current is not None:
+            yield current
+        current = (number, list(shapes))
+    if current is not None:
+        yield current
