@@ -76,14 +76,17 @@ class CannotConvert(FleetMapError):
 
 
 class CannotDerive(CannotConvert):
-    """A derivation found nothing in the stored content that it can use; ``step`` is its name."""
+    """A derivation found nothing in the stored content that it can use; ``step`` is its name.
 
-    def __init__(self, detail: str, problems: Sequence[Problem] = (), step: str = "") -> None:
+    choose: it found several things, and none was named.
+    """
+
+    def __init__(self, detail: str, problems: Sequence[Problem] = (), step: str = "", *, choose: bool = False) -> None:
         super().__init__(detail, problems)
-        self.step = step
+        self.step, self.choose = step, choose
 
-    def __reduce__(self) -> tuple[type[FleetMapError], tuple[Any, ...]]:
-        return type(self), (self.detail, self.problems, self.step)
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.detail, self.problems, self.step), {"choose": self.choose}
 
 
 class CannotGenerate(FleetMapError):

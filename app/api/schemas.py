@@ -501,6 +501,7 @@ class CoverageOut(BaseModel):
     state: Literal["direct", "derivable", "missing"]
     chain: list[dict[str, Any]]
     missing: list[str]
+    choose: str | None = Field(None, description="What the query has to name, where there are several of a kind.")
 
 
 class ReportOut(BaseModel):

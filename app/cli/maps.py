@@ -248,7 +248,9 @@ def coverage(
     told = []
     for row in rows:
         steps = [_step(step) for step in row.get("chain") or ()]
-        told.append((row["format"], row["state"], ", then ".join(steps) or "; ".join(row.get("missing") or ()) or "-"))
+        how = ", then ".join(steps) or "; ".join(row.get("missing") or ()) or "-"
+        how += f"; {row['choose']}" if row.get("choose") else ""
+        told.append((row["format"], row["state"], how.removeprefix("-; ")))
     output.show_table(("format", "state", "how, or what to supply"), told)
 
 

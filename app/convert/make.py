@@ -11,7 +11,7 @@ from typing import Any
 
 from app import derive, formats
 from app.convert import recipe as recipes
-from app.convert.recipe import Chain
+from app.convert.recipe import Chain, Hindrance
 from app.derive import Step
 from app.errors import CannotDerive, FleetMapError, MissingLayer, Problem
 from app.formats import Format, Inner, WriteContext, _archive
@@ -48,28 +48,28 @@ def make(
     return write(known, layers, values, way, entries)
 
 
-def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) -> tuple[str, str] | None:
+def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) -> Hindrance | None:
     """In a worker: the step of a chain that fails on a version's content and why, or None where all work."""
     loaded = open_store(database_url, blob_dir).load(version, way.keys)
     try:
         derive.run(way.steps, Layers(loaded.parts, version.datum, version.levels))
     except CannotDerive as error:
-        return error.step, error.detail
+        return Hindrance(error.step, error.detail, error.choose)
     except FleetMapError as error:
-        return "", error.detail
+        return Hindrance("", error.detail)
     return None
 
 
-def lacking(database_url: str, blob_dir: str, version: Version, name: str, way: Chain) -> tuple[str, str] | None:
+def lacking(database_url: str, blob_dir: str, version: Version, name: str, way: Chain) -> Hindrance | None:
     """In a worker: what a format wants of its layers besides that they are there, and they do not have, or None."""
     known = formats.get_format(name)
     loaded = open_store(database_url, blob_dir).load(version, way.keys)
     try:
         made = derive.run(way.steps, Layers(loaded.parts, version.datum, version.levels))
     except FleetMapError as error:
-        return "", error.detail
+        return Hindrance("", error.detail)
     reason = known.lacks(made) if known.lacks is not None else None
-    return None if reason is None else ("", f"{name}: {reason}")
+    return None if reason is None else Hindrance("", f"{name}: {reason}")
 
 
 def write(
@@ -122,7 +122,7 @@ def from_layers(
     """A map by the cheapest way that works on these layers. Raises what planning, deriving and writing raise."""
     own = recipes.own_options(known, asked)
     without: frozenset[str] = frozenset()
-    failed: list[str] = []
+    failed: list[Hindrance] = []
     stock = recipes.stock_of(layers)
     while True:
         try:
@@ -134,7 +134,7 @@ def from_layers(
             return write(known, kept, asked, way, entries, origin, credit)
         except CannotDerive as error:
             without |= {error.step}
-            failed.append(error.detail)
+            failed.append(Hindrance(error.step, error.detail, error.choose))
 
 
 def _inner(

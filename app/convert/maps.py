@@ -13,7 +13,7 @@ from app.convert import files as direct
 from app.convert import make as making
 from app.convert import recipe as recipes
 from app.convert.cache import Cache, Made, Product
-from app.convert.recipe import Recipe
+from app.convert.recipe import Hindrance, Recipe
 from app.errors import (
     Ambiguous,
     CannotConvert,
@@ -46,7 +46,7 @@ class Maps:
     ) -> None:
         self._store, self._run, self._limits = store, run, limits
         self.cache = Cache(cache_dir, cache_bytes)
-        self._tried: dict[Any, tuple[str, str] | None] = {}
+        self._tried: dict[Any, Hindrance | None] = {}
         self._guard = threading.Lock()
 
     def recipe(
@@ -65,17 +65,17 @@ class Maps:
         said = formats.get_format(name).by_file(file) if file else {}
         asked = {**said, **(values or {})}
         without: frozenset[str] = frozenset()
-        failed: list[str] = []
+        failed: list[Hindrance] = []
         while True:
             try:
                 found = recipes.recipe(version, name, asked, derived=derive, without=without)
             except MissingLayer as error:
                 raise recipes.exhausted(error, failed) from error
             known = self._tried.get(_content(version, found.chain)) if found.steps else None
-            if known is None or not known[0]:
+            if known is None or not known.step:
                 return found
-            without |= {known[0]}
-            failed.append(known[1])
+            without |= {known.step}
+            failed.append(known)
 
     def ready(self, recipe: Recipe) -> Made | None:
         """The map, only if it is made already."""
@@ -89,7 +89,7 @@ class Maps:
         try:
             return self.cache.get_or_make(recipe.key, lambda: self._made(recipe))
         except CannotDerive as error:
-            self._remember(_content(recipe.version, recipe.chain), (error.step, error.detail))
+            self._remember(_content(recipe.version, recipe.chain), Hindrance(error.step, error.detail, error.choose))
             raise
 
     def report(self, recipe: Recipe) -> dict[str, Any]:
@@ -134,7 +134,7 @@ class Maps:
                 continue
             line: dict[str, Any] = {"format": known.name, "state": "missing", "chain": [], "missing": []}
             try:
-                way = self._way(version, known, available)
+                way, choose = self._way(version, known, available)
             except Ambiguous as error:  # it can be made, once the caller says which one
                 line |= {"state": "direct", "choose": error.detail}
             except FleetMapError as error:
@@ -143,34 +143,44 @@ class Maps:
             else:
                 line["state"] = "derivable" if way.steps else "direct"
                 line["chain"] = [step.as_dict() for step in way.steps]
+                line |= {"choose": choose} if choose else {}
             out.append(line)
         return out
 
     def parts_of(self, version: Version, name: str) -> tuple[PartKey, ...]:
         """The stored parts that a format's map would be made of; empty where it cannot be made."""
         try:
-            return self._way(version, formats.get_format(name), recipes.stock(version)).keys
+            return self._way(version, formats.get_format(name), recipes.stock(version))[0].keys
         except FleetMapError:
             return ()
 
-    def _way(self, version: Version, known: formats.Format, available: recipes.Stock) -> recipes.Chain:
-        """The cheapest chain whose derivations work on what is stored, found by doing them once for each content."""
+    def _way(
+        self, version: Version, known: formats.Format, available: recipes.Stock
+    ) -> tuple[recipes.Chain, str | None]:
+        """The cheapest chain whose derivations work on what is stored, found by doing them once for each content; and
+        what the caller has to name for it, where it works only so."""
         without: frozenset[str] = frozenset()
-        failed: list[str] = []
+        failed: list[Problem] = []
+        unnamed: tuple[recipes.Chain, str | None] | None = None
         while True:
             try:
                 way = recipes.chain(known, available, known.write_options(), without=without)
             except MissingLayer as error:
-                raise MissingLayer(error.detail, [Problem(reason) for reason in failed]) from error
+                if unnamed is not None:
+                    return unnamed
+                raise MissingLayer(error.detail, failed) from error
             hindrance = self._hindrance(version, way) if way.steps else None
             if hindrance is None:
                 self._check_content(version, known, way)
-                return way
-            step, reason = hindrance
-            failed.append(reason)
-            if not step:
-                raise CannotConvert(reason, [Problem(reason) for reason in failed])
-            without |= {step}
+                return way, None
+            failed.append(Problem(hindrance.reason))
+            if not hindrance.step and unnamed is not None:
+                return unnamed
+            if not hindrance.step:
+                raise CannotConvert(hindrance.reason, failed)
+            if hindrance.choose:
+                unnamed = unnamed or (way, hindrance.reason)
+            without |= {hindrance.step}
 
     def _check_content(self, version: Version, known: formats.Format, way: recipes.Chain) -> None:
         """CannotConvert where the layers are there and hold too little for the format (a network without edges)."""
@@ -185,12 +195,12 @@ class Maps:
             try:
                 found = self._run(making.lacking, *where, version, known.name, way)
             except WorkerDied as error:
-                found = ("", error.detail)
+                found = Hindrance("", error.detail)
             self._remember(key, found)
         if found is not None:
-            raise CannotConvert(found[1], [Problem(found[1])])
+            raise CannotConvert(found.reason, [Problem(found.reason)])
 
-    def _hindrance(self, version: Version, way: recipes.Chain) -> tuple[str, str] | None:
+    def _hindrance(self, version: Version, way: recipes.Chain) -> Hindrance | None:
         """The step of a chain that would not work on what is stored and why (no step: none is to blame)."""
         way = recipes.needed(way)
         key = _content(version, way)
@@ -199,13 +209,13 @@ class Maps:
                 return self._tried[key]
         where = (self._store.database_url, str(self._store.blob_dir))
         try:
-            found: tuple[str, str] | None = self._run(making.hindrance, *where, version, way)
+            found: Hindrance | None = self._run(making.hindrance, *where, version, way)
         except WorkerDied as error:
-            found = ("", error.detail)
+            found = Hindrance("", error.detail)
         self._remember(key, found)
         return found
 
-    def _remember(self, key: Any, found: tuple[str, str] | None) -> None:
+    def _remember(self, key: Any, found: Hindrance | None) -> None:
         with self._guard:
             self._tried[key] = found
             while len(self._tried) > TRIED:

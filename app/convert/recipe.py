@@ -16,7 +16,7 @@ import orjson
 
 from app import __version__, derive, formats, parameters
 from app.derive import Step
-from app.errors import Invalid, MissingDatum, MissingLayer, Problem
+from app.errors import Ambiguous, CannotConvert, Invalid, MissingDatum, MissingLayer, Problem
 from app.formats import Format
 from app.model.features import Features
 from app.model.layers import LAYERS, MAP, Layer, Layers, PartKey
@@ -262,11 +262,25 @@ def missing(known: Format, available: Stock) -> list[str]:
     return [text for text in dict.fromkeys(out) if text]
 
 
-def exhausted(error: MissingLayer, failed: Sequence[str]) -> MissingLayer:
-    """Nothing is left to try: what to supply, and why the derivations that were tried found nothing."""
+@dataclass(frozen=True, slots=True)
+class Hindrance:
+    """Why a chain does not work on what is stored. step: the one to blame, empty where none is. choose: it would, with
+    one of several things named."""
+
+    step: str
+    reason: str
+    choose: bool = False
+
+
+def exhausted(error: MissingLayer, failed: Sequence[Hindrance]) -> CannotConvert:
+    """Nothing is left to try: what to name or to supply, and why the derivations that were tried found nothing."""
+    unnamed = next((one for one in failed if one.choose), None)
+    if unnamed is not None:
+        return Ambiguous(unnamed.reason)
     if not failed:
         return error
-    return MissingLayer(f"{error.detail}; what is stored does not do: {'; '.join(failed)}", error.problems)
+    reasons = "; ".join(one.reason for one in failed)
+    return MissingLayer(f"{error.detail}; what is stored does not do: {reasons}", error.problems)
 
 
 def recipe(

@@ -17,7 +17,7 @@ from functools import cache
 from typing import Any
 
 from app import parameters
-from app.errors import CannotConvert, CannotDerive, Problem
+from app.errors import Ambiguous, CannotConvert, CannotDerive, Problem
 from app.model.layers import Layer, Layers
 
 
@@ -196,6 +196,7 @@ def run(steps: Iterable[Step], layers: Layers, notes: Notes | None = None) -> La
         try:
             made = known.function(layers, known.parameters(**dict(step.given)), notes)
         except CannotConvert as error:
-            raise CannotDerive(error.detail, error.problems, step=step.name) from error
+            choose = isinstance(error, Ambiguous)
+            raise CannotDerive(error.detail, error.problems, step=step.name, choose=choose) from error
         layers = Layers({**layers.parts, **made.parts}, layers.datum or made.datum, layers.levels)
     return layers

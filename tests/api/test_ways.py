@@ -121,3 +121,24 @@ def test_over_http(api: Api) -> None:
     assert api.get("/maps/beds/kml?outlines=true", expect=None).status_code == 422, "no step on the way takes it"
     table = {row["format"]: row for row in api.get("environments/beds/versions/1/maps").json()}
     assert table["tmap2"]["state"] in ("missing", "derivable")
+
+
+ROOM = b"P5\n40 40\n255\n" + b"".join(
+    bytes(0 if r in (0, 39) or c in (0, 39) else 254 for c in range(40)) for r in range(40)
+)
+
+
+def test_of_several_grids_one_has_to_be_named(api: Api) -> None:
+    api.post("environments", {"name": "two-grids"})
+    for name in ("coarse", "fine"):
+        size = b"0.2" if name == "coarse" else b"0.1"
+        said = b"image: %s.pgm\nresolution: %s\norigin: [0, 0, 0]\nnegate: 0\n" % (name.encode(), size)
+        more = b"occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+        api.upload("two-grids", {f"{name}.yaml": said + more, f"{name}.pgm": ROOM}, grid=name)
+    rows = {row["format"]: row for row in api.get("environments/two-grids/versions/latest/maps").json()}
+    assert rows["tmap2"]["state"] == "derivable"
+    assert rows["tmap2"]["chain"][0]["step"] == "occupancy_to_topology"
+    assert rows["tmap2"]["choose"].endswith("(coarse, fine): name one with grid=")
+    refused = api.get("/maps/two-grids/tmap2", 409)
+    assert refused.json()["detail"] == rows["tmap2"]["choose"]
+    assert b"- meta:" in api.get("/maps/two-grids/tmap2?grid=fine").content
