@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any, Literal, Self
 from urllib.parse import parse_qs, unquote, urlsplit
 
-from pydantic import Field, SecretStr, field_validator, model_validator
+from pydantic import Field, SecretStr, ValidationInfo, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from app.events.ros_names import parse_chosen, parse_keys
 from app.formats import Limits
 
 _DEFAULTS = Limits()
@@ -132,7 +133,29 @@ class Settings(BaseSettings):
         "connect stands in the settings above.",
     )
     zenoh_max_reply_bytes: int = Field(
-        default=64 * 2**20, ge=1024, description="Largest file that is answered over Zenoh; HTTP has no such bound."
+        default=64 * 2**20,
+        ge=1024,
+        description="Largest file (or grid for ROS 2) that goes over Zenoh; HTTP has no such bound.",
+    )
+
+    ros2_environments: str = Field(
+        default="",
+        description="Environments whose maps go out as ROS 2 topics, separated by commas: names or patterns "
+        "(`farm-*`), below `/NAME`; or `NAME=/NAMESPACE` (`farm=/` gives `/map`). Unset: none.",
+    )
+    ros2_channel: str = Field(
+        default="",
+        pattern=r"^([a-z][a-z0-9_-]{0,62})?$",
+        description="Channel whose maps go out to ROS 2. Unset: `production` where there is one, else `latest`.",
+    )
+    ros2_domain_id: int = Field(default=0, ge=0, le=232, description="ROS 2 domain (`ROS_DOMAIN_ID`) for rmw_zenoh.")
+    ros2_keys: str = Field(
+        default="rmw_zenoh,ros2dds",
+        description="Whom the topics are for: `rmw_zenoh` (Jazzy and newer), `rmw_zenoh_humble`, `ros2dds` (robots "
+        "behind zenoh-bridge-ros2dds), separated by commas.",
+    )
+    ros2_derive: bool = Field(
+        default=False, description="Whether grids and networks that are not stored but can be derived go out, too."
     )
 
     models_dir: Path | None = Field(
@@ -243,6 +266,18 @@ class Settings(BaseSettings):
     def _client_needs_a_router(self) -> Self:
         if self.zenoh_mode == "client" and not self.zenoh_connect.strip():
             raise ValueError("zenoh_mode client needs zenoh_connect: where the router is, like tcp/router:7447")
+        return self
+
+    @field_validator("ros2_environments", "ros2_keys")
+    @classmethod
+    def _ros2_names(cls, value: str, info: ValidationInfo) -> str:
+        (parse_keys if info.field_name == "ros2_keys" else parse_chosen)(value)
+        return value
+
+    @model_validator(mode="after")
+    def _ros2_needs_zenoh(self) -> Self:
+        if self.ros2_environments.strip() and self.zenoh_mode == "off":
+            raise ValueError("ros2_environments needs zenoh_mode router or client: topics go over Zenoh")
         return self
 
     @model_validator(mode="after")

@@ -44,6 +44,7 @@ from app.api import (
     problems,
     provenance,
     robots,
+    ros2,
     tokens,
     transform,
     vda5050,
@@ -64,6 +65,8 @@ from app.convert import Maps
 from app.errors import FleetMapError, Unavailable
 from app.events.bus import Bus, BusOptions
 from app.events.relay import Relay
+from app.events.ros2 import Ros2, Ros2Options
+from app.events.ros_names import parse_chosen, parse_keys
 from app.fleet import Intake as FleetIntake
 from app.fleet import decide
 from app.ingest import Ingest, Provider
@@ -92,7 +95,7 @@ def create_app(settings: Settings) -> Server:
         here = await run_in_threadpool(open_services, settings)
         app.state.services = here
         app.state.feed = events.Feed(here)
-        relay = relay_of(settings, here)
+        publishing = [p for p in (ros2_of(settings, here), relay_of(settings, here)) if p is not None]
         app.hot = here.hot
         ticker = asyncio.create_task(_tick(here))
         try:
@@ -102,8 +105,8 @@ def create_app(settings: Settings) -> Server:
             ticker.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await ticker
-            if relay is not None:
-                await run_in_threadpool(relay.close)
+            for one in publishing:
+                await run_in_threadpool(one.close)
             await run_in_threadpool(close_services, here)
 
     app = Server(
@@ -263,6 +266,7 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
             zenoh_prefix=settings.zenoh_prefix,
             zenoh_listen=settings.zenoh_listen if settings.zenoh_mode == "router" else "",
             zenoh_advertise=settings.zenoh_advertise,
+            ros2=bool(settings.ros2_environments.strip()),
             manifest_seconds=int(settings.manifest_seconds),
         ),
         store=store,
@@ -303,7 +307,34 @@ def relay_of(settings: Settings, here: Services) -> Relay | None:
     """Events to the fleet, begun; None where they are off."""
     if settings.zenoh_mode == "off":
         return None
-    options = BusOptions(
+    bus = Bus(
+        _bus_options(settings), ask=partial(events.ask, here), on_status=here.fleet.heard, on_alive=here.fleet.alive
+    )
+    relay = Relay(here.store, bus, settings.data_dir)
+    here.fleet.start()
+    relay.start()
+    return relay
+
+
+def ros2_of(settings: Settings, here: Services) -> Ros2 | None:
+    """Topics for ROS 2, begun; None where no environment is chosen."""
+    chosen = parse_chosen(settings.ros2_environments)
+    if not chosen or settings.zenoh_mode == "off":
+        return None
+    publishing = Ros2(
+        Ros2Options(chosen, parse_keys(settings.ros2_keys), settings.ros2_domain_id),
+        _bus_options(settings),
+        settings.data_dir,
+        generation=here.store.generation,
+        look=partial(ros2.standing, here, chosen, settings.ros2_channel),
+        fetch=partial(ros2.content, here, settings.ros2_derive),
+    )
+    publishing.start()
+    return publishing
+
+
+def _bus_options(settings: Settings) -> BusOptions:
+    return BusOptions(
         mode=settings.zenoh_mode,
         listen=settings.zenoh_listen,
         connect=settings.zenoh_connect,
@@ -311,12 +342,6 @@ def relay_of(settings: Settings, here: Services) -> Relay | None:
         config=settings.zenoh_config,
         max_reply_bytes=settings.zenoh_max_reply_bytes,
     )
-
-    bus = Bus(options, ask=partial(events.ask, here), on_status=here.fleet.heard, on_alive=here.fleet.alive)
-    relay = Relay(here.store, bus, settings.data_dir)
-    here.fleet.start()
-    relay.start()
-    return relay
 
 
 def close_services(here: Services) -> None:

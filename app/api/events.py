@@ -19,7 +19,7 @@ from app.api.answers import Route
 from app.api.maps import number_of
 from app.api.schemas import told
 from app.api.services import Here, Services
-from app.errors import CannotDerive, Invalid, NotFound, Problem, Unavailable
+from app.errors import Invalid, NotFound, Problem, Unavailable
 from app.events.bus import Answer
 from app.store.values import Event
 
@@ -168,13 +168,7 @@ def ask(here: Services, environment: str, rest: str, parameters: Mapping[str, st
     if derive not in ("true", "false"):
         raise Invalid("derive must be true or false", [Problem("true or false", where="derive")])
     file = "/".join(pieces[3:]) or None
-    while True:
-        recipe = here.maps.recipe(version, pieces[2], values, derive=derive == "true", file=file)
-        try:
-            made = here.maps.ready(recipe) or here.maps.make(recipe)
-            break
-        except CannotDerive:
-            continue  # it is remembered: the next recipe goes another way, or says that there is none
+    made = here.maps.at_once(version, pieces[2], values, derive=derive == "true", file=file)
     found = made.whole() if file is None else made.file(file)
     if found is None:
         names = ", ".join(f.name for f in made.files[:20])

@@ -15,6 +15,7 @@ from app.api.metrics import CONTENT_TYPE
 from app.api.schemas import told
 from app.api.services import Here, Services
 from app.errors import Unavailable
+from app.events import ros2
 from app.events.relay import state_of
 
 READY_SECONDS = 5.0
@@ -62,7 +63,8 @@ async def readyz(request: Request) -> Response:
     """Whether database and file store answer and the schema is this release's.
 
     It also tells whether events go out over Zenoh, and where a robot finds the router (`events.connect`,
-    `events.prefix`); where they do not, maps are served all the same.
+    `events.prefix`); where they do not, maps are served all the same. Where maps go out to ROS 2, `ros2` tells how many
+    topics there are.
     """
     here: Services = request.app.state.services
     try:
@@ -75,7 +77,8 @@ async def readyz(request: Request) -> Response:
         options = here.options
         where = router_for(options.zenoh_advertise, options.zenoh_listen, request.url.hostname or "")
         events = {**events, "prefix": options.zenoh_prefix, **({"connect": where} if where else {})}
-    return answer({"status": "ready", "database": "ok", "blobs": "ok", "events": events})
+    topics = {"ros2": ros2.state_of(here.options.data_dir)} if here.options.ros2 else {}
+    return answer({"status": "ready", "database": "ok", "blobs": "ok", "events": events, **topics})
 
 
 @router.get(

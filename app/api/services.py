@@ -39,6 +39,7 @@ class ApiOptions:
     zenoh_prefix: str = "fleetmap"
     zenoh_listen: str = ""
     zenoh_advertise: str = ""
+    ros2: bool = False
     manifest_seconds: int = 86_400
 
 

@@ -92,6 +92,23 @@ class Maps:
             self._remember(_content(recipe.version, recipe.chain), Hindrance(error.step, error.detail, error.choose))
             raise
 
+    def at_once(
+        self,
+        version: Version,
+        name: str,
+        values: Mapping[str, str] | None = None,
+        *,
+        derive: bool = True,
+        file: str | None = None,
+    ) -> Made:
+        """The map, by whichever way works; blocks until it is made. Raises what ``recipe`` and ``make`` do."""
+        while True:
+            recipe = self.recipe(version, name, values, derive=derive, file=file)
+            try:
+                return self.ready(recipe) or self.make(recipe)
+            except CannotDerive:
+                continue  # it is remembered: the next recipe goes another way, or says that there is none
+
     def report(self, recipe: Recipe) -> dict[str, Any]:
         """What was raw, derived, filled in and dropped: the contract's report, for this version."""
         told = self.make(recipe).report

@@ -67,9 +67,11 @@ class Relay:
     def _run(self) -> None:
         while not self._ending.is_set():
             try:
-                if self._lock is None and not self._take_lock():
-                    self._ending.wait(POLL_SECONDS)
-                    continue
+                if self._lock is None:
+                    self._lock = take_lock(self._data_dir / LOCK_FILE)
+                    if self._lock is None:
+                        self._ending.wait(POLL_SECONDS)
+                        continue
                 self._round()
             except FleetMapError as error:
                 self._note({"state": "down", "detail": error.detail})
@@ -77,16 +79,6 @@ class Relay:
             except Exception:
                 log.exception("the relay of events stumbled")
                 self._ending.wait(POLL_SECONDS)
-
-    def _take_lock(self) -> bool:
-        handle = (self._data_dir / LOCK_FILE).open("a")
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            handle.close()
-            return False
-        self._lock = handle
-        return True
 
     def _round(self) -> None:
         """Publish what is there, then wait for more."""
@@ -144,6 +136,17 @@ class Relay:
         temporary.replace(path)
 
 
+def take_lock(path: Path) -> IO[str] | None:
+    """A file that one process of a host holds locked while it is open; None where another one has it."""
+    handle = path.open("a")
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        handle.close()
+        return None
+    return handle
+
+
 def state_of(data_dir: Path, mode: str) -> dict[str, Any]:
     """What /readyz says of events: ``off``, ``starting``, ``connected`` or ``down`` with the reason."""
     if mode == "off":
@@ -155,4 +158,4 @@ def state_of(data_dir: Path, mode: str) -> dict[str, Any]:
     return found
 
 
-__all__ = ["Relay", "Unavailable", "state_of"]
+__all__ = ["Relay", "Unavailable", "state_of", "take_lock"]

@@ -1,0 +1,101 @@
+"""What goes out as topics of ROS 2: the same maps as over HTTP, read back from the files that robots would load."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+from app import formats
+from app.api.services import Services
+from app.errors import CannotConvert, NotFound
+from app.events import cdr
+from app.events.ros2 import Content
+from app.events.ros_names import Chosen, namespace_of
+from app.formats import ReadContext, _yaml
+from app.model.frame import GROUND
+from app.model.grid import OccupancyGrid
+from app.model.layers import MAP
+from app.store.values import LATEST, Version
+
+PRODUCTION = "production"
+PAGE = 1000
+
+
+def standing(here: Services, chosen: tuple[Chosen, ...], channel: str) -> dict[str, Version]:
+    """The chosen environments that there are, each with the version that the channel stands on.
+
+    channel: empty for production where there is one, else the latest. Where it stands nowhere, nothing goes out.
+    """
+    names = [entry.pattern for entry in chosen if entry.one]
+    if any(not entry.one for entry in chosen):
+        names += [name for name in _all_names(here) if namespace_of(name, chosen) is not None]
+    out = {}
+    for name in dict.fromkeys(names):
+        for ref in [channel] if channel else [PRODUCTION, LATEST]:
+            try:
+                out[name] = here.store.version(name, ref)
+                break
+            except NotFound:
+                continue
+    return out
+
+
+def _all_names(here: Services) -> list[str]:
+    names: list[str] = []
+    cursor: str | None = None
+    while True:
+        page, cursor = here.store.environments(limit=PAGE, cursor=cursor)
+        names += [environment.name for environment in page]
+        if cursor is None:
+            return names
+
+
+def content(here: Services, derive: bool, version: Version) -> Content:
+    """Each level's grid, and the network. derive: also what is not stored but can be computed."""
+    absent: list[str] = []
+    grids: dict[str, cdr.Grid] = {}
+    for values in _grids(version, derive):
+        try:
+            grids[values["level"]] = _grid(here, version, values, derive)
+        except (CannotConvert, NotFound) as error:
+            absent.append(f"no grid of the level {values['level']}: {error.detail}")
+    order = [GROUND, *(level.name for level in version.levels)]  # levels are sorted by elevation
+    lowest = next((name for name in order if name in grids), None)
+    network = None
+    if derive or any(e.key.layer == "topology" and e.count for e in version.parts):
+        try:
+            network = _network(here, version, derive)
+        except (CannotConvert, NotFound) as error:
+            absent.append(f"no network: {error.detail}")
+    by_level = {None if level == lowest else level: grid for level, grid in sorted(grids.items())}
+    return Content(by_level, network, tuple(absent))
+
+
+def _grids(version: Version, derive: bool) -> list[dict[str, str]]:
+    """What to ask of ``occupancy_grid``: on each level the stored grid ``map``, else the only one by whatever name."""
+    stored = [e.key for e in version.parts if e.key.layer == "occupancy" and e.count]
+    names = {key.name for key in stored}
+    name = MAP if MAP in names or len(names) != 1 else names.pop()
+    levels = {key.level for key in stored if key.name == name}
+    if derive and not stored:
+        levels = {level.name for level in version.levels}
+    return [{"grid": name, "level": level} for level in sorted(levels)]
+
+
+def _grid(here: Services, version: Version, values: Mapping[str, str], derive: bool) -> cdr.Grid:
+    made = here.maps.at_once(version, "occupancy_grid", values, derive=derive)
+    files = {file.name: file.path.read_bytes() for file in made.files}
+    known = formats.get_format("occupancy_grid")
+    assert known.read is not None
+    read = known.read(files, ReadContext(here.options.limits, main=made.files[0].name))
+    grid = next(iter(read.parts.values()))
+    assert isinstance(grid, OccupancyGrid)
+    # Unknown is 255, which is -1 in a byte with a sign.
+    return cdr.Grid(grid.width, grid.height, grid.resolution, grid.origin, grid.cells.tobytes())
+
+
+def _network(here: Services, version: Version, derive: bool) -> str:
+    """The tmap2 as JSON: topological_navigation publishes it so, and who reads YAML reads JSON."""
+    made = here.maps.at_once(version, "tmap2", {}, derive=derive)
+    document = _yaml.load(made.files[0].path.read_bytes(), here.options.limits)
+    return json.dumps(document, ensure_ascii=False)

@@ -1,0 +1,86 @@
+"""Three ROS 2 messages as CDR, as ``rmw_serialize`` gives them: version 1, little endian, no padding at the end.
+
+Four bytes say the encoding (``00 01 00 00``); after them each number lies at a multiple of its size, counted from the
+end of those four. A text is its length in bytes with the closing NUL, the bytes, the NUL. Source: OMG DDSI-RTPS
+§10 and the ``.msg`` files of nav_msgs, map_msgs and std_msgs.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from datetime import datetime
+
+HEADER = b"\x00\x01\x00\x00"
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """What an OccupancyGrid says. cells: int8 row by row from the bottom, -1 unknown (byte 255), else 0…100.
+
+    origin: (x, y, yaw) of the lower left corner of cell (0, 0), metres and radians.
+    """
+
+    width: int
+    height: int
+    resolution: float
+    origin: tuple[float, float, float]
+    cells: bytes
+
+    @property
+    def frame(self) -> tuple[int, int, float, tuple[float, float, float]]:
+        """Where its cells lie: an update makes sense only between grids that agree in it."""
+        return self.width, self.height, self.resolution, self.origin
+
+
+def occupancy_grid(grid: Grid, stamp: datetime, frame_id: str) -> bytes:
+    """``nav_msgs/msg/OccupancyGrid``. stamp: for the header and ``map_load_time``."""
+    x, y, yaw = grid.origin
+    made = _Writer(_header(stamp, frame_id))
+    made.pack("iIfII", *_time(stamp), grid.resolution, grid.width, grid.height)
+    made.pack("7d", x, y, 0.0, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+    return made.sequence(grid.cells)
+
+
+def occupancy_grid_update(
+    x: int, y: int, width: int, height: int, cells: bytes, stamp: datetime, frame_id: str
+) -> bytes:
+    """``map_msgs/msg/OccupancyGridUpdate``: a rectangle of cells; (x, y) is its lower left cell (column, row)."""
+    made = _Writer(_header(stamp, frame_id))
+    made.pack("iiII", x, y, width, height)
+    return made.sequence(cells)
+
+
+def string(text: str) -> bytes:
+    """``std_msgs/msg/String``."""
+    return HEADER + _text(text)
+
+
+class _Writer:
+    def __init__(self, start: bytes) -> None:
+        self._data = bytearray(start)
+
+    def pack(self, numbers: str, *values: float) -> None:
+        """Numbers of one size, aligned to it."""
+        size = struct.calcsize("<" + numbers[-1])
+        self._data += bytes(-(len(self._data) - len(HEADER)) % size) + struct.pack("<" + numbers, *values)
+
+    def sequence(self, items: bytes) -> bytes:
+        """A sequence of bytes, the last member."""
+        self.pack("I", len(items))
+        return bytes(self._data) + items
+
+
+def _header(stamp: datetime, frame_id: str) -> bytes:
+    return HEADER + struct.pack("<iI", *_time(stamp)) + _text(frame_id)
+
+
+def _time(stamp: datetime) -> tuple[int, int]:
+    seconds = math.floor(stamp.timestamp())
+    return seconds, stamp.microsecond * 1000
+
+
+def _text(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return struct.pack("<I", len(data)) + data

@@ -1,0 +1,356 @@
+"""Maps as topics of ROS 2, without a ROS node: latched grids, their changes, and networks, in CDR over Zenoh.
+
+A thread with a session of its own, since messages are large and must not be dropped: Zenoh drops what waits for more
+than 50 ms, and blocks the session instead where it is told to; events would wait with it. What a channel stands on is
+looked at after each commit, so what goes out is always a whole state, and the last one, never a queue of them.
+
+Latched: rmw_zenoh and zenoh-bridge-ros2dds (since 1.5.1) subscribe with history to publishers that keep their last
+samples and can be detected; a plain publisher tells late joiners nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import zenoh
+from zenoh import ext
+
+from app.errors import FleetMapError
+from app.events import cdr, ros_names
+from app.events.bus import BusOptions, session_configuration
+from app.events.relay import take_lock
+from app.events.ros_names import Chosen, Keys, Topic
+from app.store.values import Version
+
+log = logging.getLogger(__name__)
+
+FRAME = "map"
+"""The frame of all maps, as Nav2 and topological_navigation call it."""
+
+HEARTBEAT_SECONDS = 0.5
+LOOK_SECONDS = 0.02
+POLL_SECONDS = 1.0
+RETRY_SECONDS = 30.0
+"""After a map could not be made it is tried again so much later, or when the channel moves."""
+
+LOCK_FILE = "ros2.lock"
+STATE_FILE = "ros2.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Ros2Options:
+    """What goes out, and on whose keys."""
+
+    chosen: tuple[Chosen, ...]
+    keys: tuple[Keys, ...] = ("rmw_zenoh", "ros2dds")
+    domain: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Content:
+    """What an environment has to say. grids: by level, None for the lowest. network: the tmap2 as JSON. absent: why
+    something is not there, for the log."""
+
+    grids: Mapping[str | None, cdr.Grid]
+    network: str | None
+    absent: tuple[str, ...] = ()
+
+
+Look = Callable[[], Mapping[str, Version]]
+"""The chosen environments, each with the version that its channel stands on."""
+
+Fetch = Callable[[Version], Content]
+"""What is in a version. Raises FleetMapError where it cannot be had now."""
+
+
+class Publisher:
+    """A topic on one kind of keys. It is detected and keeps its last message as long as it is held."""
+
+    def __init__(self, session: zenoh.Session, topic: Topic, style: Keys, domain: int, entity: int) -> None:
+        key = topic.key(style, domain)
+        reliable, block = zenoh.Reliability.RELIABLE, zenoh.CongestionControl.BLOCK
+        self._publisher: Any
+        if topic.latched:
+            self._publisher = ext.declare_advanced_publisher(
+                session,
+                key,
+                cache=ext.CacheConfig(topic.depth),
+                publisher_detection=True,
+                sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT_SECONDS),
+                reliability=reliable,
+                congestion_control=block,
+            )
+        else:
+            self._publisher = session.declare_publisher(key, reliability=reliable, congestion_control=block)
+        token = topic.token(style, domain, str(session.info.zid()), entity)
+        self._token: Any = session.liveliness().declare_token(token)
+        # rmw_zenoh hashes the token by XXH3; for who receives it is just an id that stays the same.
+        self._gid = hashlib.sha256(token.encode()).digest()[:16]
+        self._attached = style != "ros2dds"
+        self._count = 0
+
+    def put(self, payload: zenoh.ZBytes) -> None:
+        """Publish; rmw_zenoh drops what comes without its attachment."""
+        if not self._attached:
+            self._publisher.put(payload)
+            return
+        self._count += 1
+        said = (ext.Int64(self._count), ext.Int64(time.time_ns()), self._gid)
+        self._publisher.put(payload, attachment=ext.z_serialize(said))
+
+    def close(self) -> None:
+        """Say that it is gone."""
+        for held in (self._token, self._publisher):
+            with contextlib.suppress(Exception):
+                held.undeclare()
+
+
+@dataclass(slots=True)
+class _Out:
+    """A topic on all its keys, and what was said last."""
+
+    publishers: Sequence[Publisher]
+    last: cdr.Grid | str | None = None
+
+    def put(self, payload: bytes) -> None:
+        shared = zenoh.ZBytes(payload)
+        for publisher in self.publishers:
+            publisher.put(shared)
+
+    def close(self) -> None:
+        for publisher in self.publishers:
+            publisher.close()
+
+
+@dataclass(slots=True)
+class _Place:
+    """An environment: the root that was told, and its topics by name. retry: when it is told again after a failure."""
+
+    root: str = ""
+    topics: dict[str, _Out] = field(default_factory=dict)
+    retry: float | None = None
+
+
+class Ros2:
+    """The thread. One process of a data folder publishes (it holds a file lock); where it dies, another takes over."""
+
+    def __init__(
+        self,
+        options: Ros2Options,
+        bus: BusOptions,
+        data_dir: Path,
+        *,
+        generation: Callable[[], int],
+        look: Look,
+        fetch: Fetch,
+    ) -> None:
+        self._options, self._bus, self._data_dir = options, bus, data_dir
+        self._generation, self._look, self._fetch = generation, look, fetch
+        self._session: zenoh.Session | None = None
+        self._node: Any = None
+        self._entities = 0
+        self._places: dict[str, _Place] = {}
+        self._owners: dict[str, str] = {}
+        self._lock: IO[str] | None = None
+        self._told: dict[str, Any] = {}
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="fleetmap-ros2", daemon=True)
+
+    def start(self) -> None:
+        """Begin; returns at once."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Take all topics back."""
+        self._ending.set()
+        self._thread.join(15)
+        self._shut()
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def _run(self) -> None:
+        while not self._ending.is_set():
+            try:
+                if self._lock is None:
+                    self._lock = take_lock(self._data_dir / LOCK_FILE)
+                    if self._lock is None:
+                        self._ending.wait(POLL_SECONDS)
+                        continue
+                self._round()
+            except FleetMapError as error:
+                self._note({"state": "down", "detail": error.detail})
+                self._ending.wait(POLL_SECONDS)
+            except Exception:
+                log.exception("publishing to ROS 2 stumbled")
+                self._shut()  # what was said last is not known for sure
+                self._ending.wait(POLL_SECONDS)
+
+    def _round(self) -> None:
+        """Publish what has changed, then wait for more."""
+        if self._session is None and not self._open():
+            self._ending.wait(POLL_SECONDS)
+            return
+        generation = self._generation()
+        self._tell(self._look())
+        self._note({"state": "connected", "topics": len(self._owners)})
+        asked = time.monotonic()
+        while not self._ending.wait(LOOK_SECONDS):
+            if self._generation() != generation or time.monotonic() - asked > POLL_SECONDS:
+                return
+
+    def _open(self) -> bool:
+        try:
+            self._session = zenoh.open(zenoh.Config.from_json5(session_configuration(self._bus)))
+            if any(style != "ros2dds" for style in self._options.keys):
+                zid = str(self._session.info.zid())
+                self._node = self._session.liveliness().declare_token(ros_names.node_token(self._options.domain, zid))
+        except FleetMapError:
+            raise
+        except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
+            self._shut()
+            self._note({"state": "down", "detail": f"no router: {str(error).splitlines()[0][:300]}"})
+            return False
+        return True
+
+    def _shut(self) -> None:
+        for name in list(self._places):
+            self._retire(name, ())
+        self._places.clear()
+        if self._session is not None:
+            with contextlib.suppress(Exception):
+                _close(self._session)
+        self._session = self._node = None
+        self._entities = 0
+
+    # --- what has changed ---
+
+    def _tell(self, standing: Mapping[str, Version]) -> None:
+        for name in [n for n in self._places if n not in standing]:
+            self._retire(name, ())
+            del self._places[name]
+        for name, version in standing.items():
+            if self._ending.is_set():
+                return
+            place = self._places.setdefault(name, _Place())
+            waits = place.retry is not None and time.monotonic() < place.retry
+            if place.root == version.root and (place.retry is None or waits):
+                continue
+            place.root, place.retry = version.root, None
+            try:
+                content = self._fetch(version)
+            except FleetMapError as error:
+                log.warning("ROS 2: %s stays as it is: %s", name, error.detail)
+                place.retry = time.monotonic() + RETRY_SECONDS
+                continue
+            for reason in content.absent:
+                log.warning("ROS 2: %s, version %d: %s", name, version.number, reason)
+            self._publish(name, place, version, content)
+
+    def _publish(self, name: str, place: _Place, version: Version, content: Content) -> None:
+        namespace = ros_names.namespace_of(name, self._options.chosen)
+        assert namespace is not None
+        wanted: set[str] = set()
+        for level, grid in content.grids.items():
+            topic, updates = ros_names.map_topic(namespace, level), ros_names.update_topic(namespace, level)
+            if topic.name in wanted:
+                log.error("ROS 2: a level of %s is left out: another one has its topic %s", name, topic.name)
+                continue
+            size = grid.width * grid.height
+            if size > self._bus.max_reply_bytes:
+                log.error("ROS 2: %s is left out: %d bytes are more than is sent over Zenoh", topic.name, size)
+                continue
+            out, changes = self._out(name, place, topic), self._out(name, place, updates)
+            if out is None or changes is None:
+                continue
+            wanted |= {topic.name, updates.name}
+            before = out.last
+            if before == grid:
+                continue
+            if isinstance(before, cdr.Grid) and before.frame == grid.frame:
+                changes.put(update(before, grid, version))
+            out.put(cdr.occupancy_grid(grid, version.time, FRAME))
+            out.last = grid
+            log.info("ROS 2: %s is version %d of %s", topic.name, version.number, name)
+        if content.network is not None:
+            topic = ros_names.network_topic(namespace)
+            out = self._out(name, place, topic)
+            if out is not None:
+                wanted.add(topic.name)
+                if out.last != content.network:
+                    out.put(cdr.string(content.network))
+                    out.last = content.network
+                    log.info("ROS 2: %s is version %d of %s", topic.name, version.number, name)
+        self._retire(name, wanted)
+
+    def _out(self, name: str, place: _Place, topic: Topic) -> _Out | None:
+        """The topic, declared; None where another environment has it."""
+        known = place.topics.get(topic.name)
+        if known is not None:
+            return known
+        owner = self._owners.get(topic.name)
+        if owner is not None:
+            log.error("ROS 2: %s of %s is left out: %s has that topic; give namespaces", topic.name, name, owner)
+            return None
+        assert self._session is not None
+        publishers = []
+        for style in self._options.keys:
+            self._entities += 1
+            publishers.append(Publisher(self._session, topic, style, self._options.domain, self._entities))
+        made = _Out(publishers)
+        place.topics[topic.name] = made
+        self._owners[topic.name] = name
+        return made
+
+    def _retire(self, name: str, wanted: Sequence[str] | set[str]) -> None:
+        place = self._places[name]
+        for topic in [t for t in place.topics if t not in wanted]:
+            place.topics.pop(topic).close()
+            del self._owners[topic]
+
+    def _note(self, state: dict[str, Any]) -> None:
+        """Tell the log when it changes, and all workers by a file."""
+        if state == self._told:
+            return
+        if state["state"] != self._told.get("state") and state["state"] != "connected":
+            log.error("NOTHING GOES OUT TO ROS 2: %s", state.get("detail", ""))
+        self._told = state
+        path = self._data_dir / STATE_FILE
+        temporary = path.with_suffix(f".{os.getpid()}")
+        temporary.write_text(json.dumps(state))
+        temporary.replace(path)
+
+
+def update(before: cdr.Grid, after: cdr.Grid, version: Version) -> bytes:
+    """The smallest rectangle that holds all cells in which two different grids of one frame differ, as a message."""
+    shape = (after.height, after.width)
+    new = np.frombuffer(after.cells, np.int8).reshape(shape)
+    changed = new != np.frombuffer(before.cells, np.int8).reshape(shape)
+    rows, columns = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
+    y0, y1, x0, x1 = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    block = new[y0:y1, x0:x1].tobytes()
+    return cdr.occupancy_grid_update(x0, y0, x1 - x0, y1 - y0, block, version.time, FRAME)
+
+
+def state_of(data_dir: Path) -> dict[str, Any]:
+    """What /readyz says of topics: ``starting``, ``connected`` with their number, or ``down`` with the reason."""
+    try:
+        found: dict[str, Any] = json.loads((data_dir / STATE_FILE).read_text())
+    except (OSError, ValueError):
+        return {"state": "starting"}
+    return found
+
+
+def _close(session: Any) -> None:
+    session.close()
