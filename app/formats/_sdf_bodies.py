@@ -226,7 +226,7 @@ class Bodies:
     def _static(
         self, name: str, pose: Sequence[float], shapes: Sequence[Mapping[str, Any]], colour: str | None, own: Any
     ) -> etree._Element:
-        """A static model with a collision and a visual for each shape."""
+        """A static model with a collision and a visual for each shape, or what of both it has."""
         model = etree.Element("model", name=name)
         if any(pose):
             model.append(_sdf.pose_element(pose))
@@ -235,14 +235,14 @@ class Bodies:
         material = own.get("material") if isinstance(own, Mapping) else None
         for k, shape in enumerate(shapes):
             for tag in ("collision", "visual"):
-                if tag == "collision" and shape.get("visual") is True:
+                if shape.get("visual" if tag == "collision" else "unseen") is True:
                     continue
                 part = _sdf.child(link, tag, name=f"{tag}_{k}")
                 if any(shape.get("pose", ())):
                     part.append(_sdf.pose_element(shape["pose"]))
                 part.append(_sdf.geometry_element(shape, shape.get("uri")))
                 if tag == "visual":
-                    _material(part, colour, material)
+                    _material(part, _colour(shape) or colour, material)
         return model
 
     # --- ground and walls ----------------------------------------------------------------------------------------
@@ -281,6 +281,16 @@ class Bodies:
         self._box.append((float(low[0]), float(low[1]), float(high[0]), float(high[1])))
         shape = {"type": "mesh", "scale": [1.0, 1.0, 1.0], "uri": f"model://{file}"}
         return self._static(name, [x, y, elevation, 0.0, 0.0, yaw], [shape], COLOURS["wall"], None)
+
+
+def _colour(shape: Mapping[str, Any]) -> str | None:
+    """The colour that a shape tells: three or four numbers from 0 to 1, as Gazebo reads them."""
+    said = shape.get("colour")
+    if not isinstance(said, (list, tuple)) or len(said) not in (3, 4):
+        return None
+    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and 0.0 <= v <= 1.0 for v in said):
+        return None
+    return _sdf.words([*said, 1.0][:4])
 
 
 def _material(visual: etree._Element, colour: str | None, script: Any) -> None:

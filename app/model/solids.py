@@ -18,7 +18,8 @@ mesh       file, scale [x, y, z], submesh, center        the file's
 heightmap  file, size [x, y, z], position [x, y, z]      its middle; the picture's brightest pixel is at size z
 ========== ============================================= ==============================================================
 
-``visual: true`` marks a shape that only visuals have: nothing collides with it.
+``visual: true`` marks a shape that only visuals have: nothing collides with it; ``unseen: true`` one that is only
+collided with. ``colour`` [r, g, b] or [r, g, b, a], 0 to 1, is how it is shown.
 """
 
 from __future__ import annotations

@@ -612,6 +612,21 @@ def test_objects_of_other_formats_become_static_models() -> None:
     assert write(parts, None, (Level(), Level("L2", 3.0)), wall_height=2.0, building_height=5.0) == files
 
 
+def test_shapes_may_be_felt_or_seen_only_and_have_colours() -> None:
+    shapes: list[dict[str, Any]] = [
+        {"type": "cylinder", "radius": 0.1, "length": 2.0, "unseen": True},
+        {"type": "sphere", "radius": 1.0, "visual": True, "colour": [0.2, 0.5, 0.1]},
+        {"type": "box", "size": [1.0, 1.0, 1.0], "colour": [2, "</diffuse>", None]},
+    ]
+    rows = [("tree", shapely.Point(0, 0), {"kind": "tree", "shapes": shapes})]
+    files = write({PartKey("objects", name="generated"): features(rows, "local")})
+    assert check(files) == []
+    model = next(e for e in tree(files).iter("model") if e.get("name") == "tree")
+    assert [e.get("name") for e in model.iter("collision")] == ["collision_0", "collision_2"]
+    assert [e.get("name") for e in model.iter("visual")] == ["visual_1", "visual_2"]
+    assert [e.text for e in model.iter("diffuse")] == ["0.2 0.5 0.1 1.0"], "what is no colour is none"
+
+
 def test_places_on_earth_are_brought_to_the_local_frame() -> None:
     datum = Datum(53.0, -0.5, heading=20.0)
     frame = Layers({}, datum).frame

@@ -1,0 +1,420 @@
+"""L-systems: bracketed, parametric and stochastic rewriting, and the turtle that draws what comes out.
+
+Rules are text, one statement a line (or between semicolons); a line that leaves a bracket open goes on in the next one;
+``#`` begins a comment::
+
+    taper = 0.7                                     # a constant
+    axiom: !(0.05) F(0.5) A(1, 0.05)
+    A(l, w) : l > 0.2 -> F(l, w * taper) [ +(rand(20, 40)) A(l * 0.6, w * taper) ] /(137.5) A(l * 0.8, w * taper)
+    A(l, w) : l <= 0.2 @ 3 -> L(0.1)                # of the rules that apply one is taken, this one with weight 3
+    A(l, w) : l <= 0.2 @ 1 -> O(0.03)
+
+A symbol is one letter or sign, with its values in parentheses. A rule holds for the symbol with as many values as it
+names, where its condition is true; a symbol that no rule holds for stays. Expressions: ``_expressions``. The turtle
+starts at the origin and looks up (z), and knows
+
+=================== ================================================= ==========================================
+``F(length, r)``    goes forward and draws, its radius becoming ``r`` left out: ``length`` of the system, radius kept
+``f(length)``       goes forward and draws nothing
+``+(a)``, ``-(a)``  turns left, right by degrees                      left out: the system's ``angle``
+``&(a)``, ``^(a)``  pitches down, up
+``\\(a)``, ``/(a)``  rolls left, right
+``|``               turns round
+``$``               rolls until its left side is level
+``!(r)``            sets the radius in metres
+``[``, ``]``        remembers where it is, and goes back there
+``L(size)``         a leaf of this length
+``O(radius)``       a fruit
+=================== ================================================= ==========================================
+
+Source: Prusinkiewicz and Lindenmayer, The Algorithmic Beauty of Plants (1990), chapter 1 (their signs, and their
+meaning of parametric and stochastic rules). A system that grows beyond a stated bound is stopped while it grows.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from app.errors import CannotGenerate, Problem
+from app.generate import _expressions
+from app.generate._expressions import Expression, refuse
+
+MOST_SYMBOLS = 100_000
+"""Of a system at any time."""
+
+MOST_WORK = 1_000_000
+"""Symbols that are rewritten, of all plants of one generation together."""
+
+MOST_DRAWN = 20_000
+"""Branches, leaves and fruit of one plant."""
+
+MOST_TEXT, MOST_RULES, MOST_WORDS = 20_000, 200, 500
+"""Characters of rules, statements, and symbols on one side of a rule."""
+
+MOST_ITERATIONS = 40
+DEEPEST = 200
+"""Brackets within each other."""
+
+LARGEST = 1000.0
+"""Metres that a plant may reach from its root."""
+
+TURTLE: Mapping[str, tuple[int, int]] = {
+    "F": (0, 2), "f": (0, 1), "L": (0, 1), "O": (0, 1), "!": (1, 1), "|": (0, 0), "$": (0, 0), "[": (0, 0), "]": (0, 0),
+    **dict.fromkeys("+-&^\\/", (0, 1)),
+}  # fmt: skip
+"""The signs that the turtle knows, and how many values each takes."""
+
+_LETTER = re.compile(r"[A-Za-z]")
+_CONSTANT = re.compile(r"\s*([A-Za-z_][A-Za-z0-9_]*)\s*=(?!=)(.*)", re.DOTALL)
+_AXIOM = re.compile(r"\s*axiom\s*:(.*)", re.DOTALL)
+_RULE = re.compile(r"\s*([A-Za-z])\s*(?:\(([^()]*)\))?\s*(?::(.*))?\s*", re.DOTALL)
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+Symbol = tuple[str, tuple[float, ...]]
+"""A letter or sign with its values."""
+
+Word = tuple[str, tuple[Expression, ...]]
+"""The same in a rule, before its values are known."""
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One way to rewrite a symbol. names: of its values. where: its statement."""
+
+    symbol: str
+    names: tuple[str, ...]
+    condition: Expression | None
+    weight: Expression | None
+    after: tuple[Word, ...]
+    where: str
+
+
+@dataclass(frozen=True, slots=True)
+class System:
+    """A checked L-system. constants: by name."""
+
+    axiom: tuple[Word, ...]
+    rules: Mapping[tuple[str, int], tuple[Rule, ...]]
+    constants: Mapping[str, float]
+
+
+@dataclass(slots=True)
+class Budget:
+    """What one generation may still rewrite."""
+
+    left: int = MOST_WORK
+
+
+# --- reading rules ---------------------------------------------------------------------------------------------------
+
+
+def parse(text: str) -> System:
+    """The system that these rules describe. Invalid names the statement and what is wrong with it."""
+    if len(text) > MOST_TEXT:
+        refuse(f"the rules have {len(text)} characters; the limit is {MOST_TEXT}", "rules")
+    statements = _statements(text)
+    if len(statements) > MOST_RULES:
+        refuse(f"there are {len(statements)} statements; the limit is {MOST_RULES}", "rules")
+    constants: dict[str, float] = {}
+    axiom: tuple[Word, ...] | None = None
+    rules: dict[tuple[str, int], list[Rule]] = {}
+    never = np.random.Generator(np.random.PCG64(0))
+    for k, said in enumerate(statements):
+        where = f"rules, statement {k + 1}"
+        head, arrow, tail = said.partition("->")
+        if arrow:
+            rule = _rule(head, tail, constants, where)
+            rules.setdefault((rule.symbol, len(rule.names)), []).append(rule)
+        elif found := _AXIOM.fullmatch(said):
+            if axiom is not None:
+                refuse("there is an axiom already", where)
+            axiom = _words(found[1], frozenset(constants), where)
+        elif found := _CONSTANT.fullmatch(said):
+            if found[1] in constants:
+                refuse(f"{found[1]!r} has a value already", where)
+            if "rand" in found[2]:
+                refuse("a constant cannot be drawn by chance: put rand into a rule", where)
+            constants[found[1]] = _expressions.parse(found[2], frozenset(constants), where)(constants, never)
+        else:
+            refuse(f"{said[:60]!r} is none of: axiom: …, name = number, symbol -> symbols", where)
+    if axiom is None:
+        refuse("an axiom is missing: axiom: F A(1)", "rules")
+    system = System(axiom, {key: tuple(found) for key, found in rules.items()}, constants)
+    _check_symbols(system)
+    return system
+
+
+def _statements(text: str) -> list[str]:
+    """The statements without comments; lines are joined while a bracket is open."""
+    out: list[str] = []
+    open_ = 0
+    for line in text.splitlines():
+        for k, piece in enumerate(line.partition("#")[0].split(";")):
+            if k == 0 and open_ > 0 and out:
+                out[-1] += " " + piece
+            else:
+                out.append(piece)
+                open_ = 0
+            open_ += sum(piece.count(s) for s in "[(") - sum(piece.count(s) for s in "])")
+    return [said.strip() for said in out if said.strip()]
+
+
+def _rule(head: str, tail: str, constants: Mapping[str, float], where: str) -> Rule:
+    head, at, chance = head.partition("@")
+    found = _RULE.fullmatch(head)
+    if found is None:
+        refuse(f"{head.strip()[:60]!r} is no symbol with names, such as A(l, w) : l > 1 @ 2", where)
+    names = tuple(part.strip() for part in found[2].split(",")) if found[2] and found[2].strip() else ()
+    if not all(_NAME.fullmatch(name) for name in names) or len(set(names)) != len(names) or len(names) > 8:
+        refuse(f"({found[2]}) must be up to 8 different names", where)
+    known = frozenset({*constants, *names})
+    said = found[3] or ""
+    if found[3] is not None and not said.strip():
+        refuse("a condition is missing behind :", where)
+    condition = _expressions.parse(said, known, where) if said.strip() else None
+    weight = _expressions.parse(chance, known, where) if at else None
+    return Rule(found[1], names, condition, weight, _words(tail, known, where), where)
+
+
+def _words(text: str, names: frozenset[str], where: str) -> tuple[Word, ...]:
+    """Symbols with the expressions of their values; brackets must come in pairs."""
+    out: list[Word] = []
+    at = open_ = 0
+    while at < len(text):
+        letter = text[at]
+        at += 1
+        if letter.isspace():
+            continue
+        if not (_LETTER.fullmatch(letter) or letter in TURTLE):
+            refuse(f"{letter!r} is no symbol: letters and {' '.join(s for s in TURTLE if not s.isalpha())} are", where)
+        open_ += (letter == "[") - (letter == "]")
+        if open_ < 0:
+            refuse("] without [", where)
+        rest = re.match(r"\s*\(", text[at:])
+        values: tuple[Expression, ...] = ()
+        if rest is not None:
+            inside, at = _inside(text, at + rest.end(), where)
+            values = tuple(_expressions.parse(one, names, where) for one in inside)
+        out.append((letter, values))
+        if len(out) > MOST_WORDS:
+            refuse(f"there are more than {MOST_WORDS} symbols on one side", where)
+    if open_:
+        refuse("[ without ]", where)
+    return tuple(out)
+
+
+def _inside(text: str, at: int, where: str) -> tuple[list[str], int]:
+    """The values behind an opening parenthesis, cut at their commas, and where they end."""
+    start, deep, out = at, 0, []
+    while at < len(text):
+        sign = text[at]
+        if sign == ")" and deep == 0:
+            out.append(text[start:at])
+            return out, at + 1
+        if sign == "," and deep == 0:
+            out.append(text[start:at])
+            start = at + 1
+        deep += (sign == "(") - (sign == ")")
+        at += 1
+    return refuse(") is missing", where)
+
+
+def _check_symbols(system: System) -> None:
+    """Every letter has a meaning: a rule for as many values, or the turtle's."""
+    sides = [("axiom", system.axiom), *((r.where, r.after) for rules in system.rules.values() for r in rules)]
+    for where, words in sides:
+        for letter, values in words:
+            least, most = TURTLE.get(letter, (1, 0))
+            if least <= len(values) <= most or (letter, len(values)) in system.rules:
+                continue
+            takes = [str(n) for symbol, n in system.rules if symbol == letter]
+            takes += [f"{least} to {most}" if least < most else str(least)] if letter in TURTLE else []
+            if takes:
+                refuse(f"{letter} has {len(values)} values and takes {' or '.join(takes)}", where)
+            refuse(f"no rule says what becomes of {letter}, and the turtle does not know it", where)
+
+
+# --- rewriting -------------------------------------------------------------------------------------------------------
+
+
+def expand(system: System, iterations: int, chance: np.random.Generator, budget: Budget | None = None) -> list[Symbol]:
+    """The symbols after so many rounds of rewriting. CannotGenerate where they become too many, and when."""
+    budget = budget or Budget()
+    symbols = _made(system.axiom, system.constants, chance)
+    for k in range(iterations):
+        out: list[Symbol] = []
+        changed = False
+        for symbol in symbols:
+            rules = system.rules.get((symbol[0], len(symbol[1])))
+            after = None if rules is None else _rewritten(system, rules, symbol, chance)
+            if after is None:
+                out.append(symbol)
+            else:
+                changed = True
+                out += after
+            if len(out) > MOST_SYMBOLS:
+                _explodes(f"has more than {MOST_SYMBOLS} symbols after {k} of {iterations} rounds and before the next")
+        budget.left -= len(symbols)
+        if budget.left < 0:
+            _explodes(f"has taken {MOST_WORK} symbols to rewrite after {k + 1} of {iterations} rounds")
+        symbols = out
+        if not changed:
+            break
+    return symbols
+
+
+def _explodes(what: str) -> None:
+    why = f"the L-system {what}: give fewer iterations, or conditions that end its growth"
+    raise CannotGenerate(why, [Problem(f"the L-system {what}", where="rules")])
+
+
+def _made(words: Iterable[Word], names: Mapping[str, float], chance: np.random.Generator) -> list[Symbol]:
+    return [(letter, tuple([value(names, chance) for value in values])) for letter, values in words]
+
+
+def _rewritten(
+    system: System, rules: Sequence[Rule], symbol: Symbol, chance: np.random.Generator
+) -> list[Symbol] | None:
+    """What becomes of a symbol; None where no rule holds."""
+    names = dict(system.constants)
+    holding: list[Rule] = []
+    for rule in rules:
+        known = {**names, **dict(zip(rule.names, symbol[1], strict=True))}
+        if rule.condition is None or rule.condition(known, chance) != 0:
+            holding.append(rule)
+    if not holding:
+        return None
+    chosen = holding[0]
+    if len(holding) > 1:
+        weights = []
+        for rule in holding:
+            known = {**names, **dict(zip(rule.names, symbol[1], strict=True))}
+            weights.append(1.0 if rule.weight is None else rule.weight(known, chance))
+        if min(weights) < 0 or not sum(weights) > 0:
+            problem = "weights must not be negative, and one must be above 0"
+            raise CannotGenerate(f"{chosen.where}: {problem}", [Problem(problem, where=chosen.where)])
+        left = float(chance.random()) * sum(weights)
+        for rule, weight in zip(holding, weights, strict=True):
+            chosen = rule
+            left -= weight
+            if left < 0:
+                break
+    known = {**names, **dict(zip(chosen.names, symbol[1], strict=True))}
+    return _made(chosen.after, known, chance)
+
+
+# --- drawing ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class Drawing:
+    """What the turtle drew, in metres. Each branch: (start, end, radius at the start, at the end, left, up); each leaf:
+    (place, heading, left, length); each fruit: (place, radius). stem: length of what was drawn before the first fork.
+    """
+
+    branches: list[tuple[Vector, Vector, float, float, Vector, Vector]] = field(default_factory=list)
+    leaves: list[tuple[Vector, Vector, Vector, float]] = field(default_factory=list)
+    fruit: list[tuple[Vector, float]] = field(default_factory=list)
+    stem: float = 0.0
+
+
+@dataclass(slots=True)
+class _State:
+    at: Vector
+    h: Vector
+    l: Vector  # noqa: E741 - the book's name
+    u: Vector
+    radius: float
+
+
+def draw(symbols: Iterable[Symbol], *, angle: float, length: float, radius: float) -> Drawing:
+    """Follow the turtle. angle (degrees), length and radius (metres) hold where a symbol says none.
+
+    CannotGenerate where there is too much to draw, or it leads too far away.
+    """
+    out = Drawing()
+    now = _State((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), radius)
+    stack: list[_State] = []
+    forked = False
+    for letter, values in symbols:
+        first = values[0] if values else None
+        if letter in ("F", "f"):
+            start = now.at
+            now.at = _plus(start, now.h, length if first is None else first)
+            if not max(map(abs, now.at)) <= LARGEST:
+                _beyond(f"reaches more than {LARGEST:g} m from its root")
+            if letter == "F":
+                end = max(0.0, values[1]) if len(values) > 1 else now.radius
+                out.branches.append((start, now.at, now.radius, end, now.l, now.u))
+                now.radius = end
+                if not forked:
+                    out.stem = max(out.stem, now.at[2])
+        elif letter in "+-&^\\/|":
+            turn = 180.0 if letter == "|" else angle if first is None else first
+            _turn(now, letter, turn)
+        elif letter == "$":
+            _level(now)
+        elif letter == "!":
+            now.radius = max(0.0, values[0])
+        elif letter == "[":
+            forked = forked or bool(out.branches)
+            stack.append(_State(now.at, now.h, now.l, now.u, now.radius))
+            if len(stack) > DEEPEST:
+                _beyond(f"has more than {DEEPEST} brackets within each other")
+        elif letter == "]":
+            now = stack.pop()
+        elif letter == "L":
+            out.leaves.append((now.at, now.h, now.l, abs(length if first is None else first)))
+        elif letter == "O":
+            out.fruit.append((now.at, abs(radius if first is None else first)))
+        if len(out.branches) + len(out.leaves) + len(out.fruit) > MOST_DRAWN:
+            _beyond(f"has more than {MOST_DRAWN} branches, leaves and fruit")
+    return out
+
+
+def _beyond(what: str) -> None:
+    raise CannotGenerate(f"the plant {what}: give fewer iterations", [Problem(f"the plant {what}", where="rules")])
+
+
+def _plus(a: Vector, b: Vector, times: float) -> Vector:
+    return (a[0] + b[0] * times, a[1] + b[1] * times, a[2] + b[2] * times)
+
+
+def _mixed(a: Vector, c: float, b: Vector, s: float) -> Vector:
+    return (a[0] * c + b[0] * s, a[1] * c + b[1] * s, a[2] * c + b[2] * s)
+
+
+def _turn(now: _State, sign: str, degrees: float) -> None:
+    """Left and right about the up axis, down and up about the left one; rolling left the left side goes down."""
+    # Rounded, so that the last bit of a machine's sine shows nowhere.
+    a = math.radians(math.remainder(degrees, 360.0))
+    c, s = round(math.cos(a), 12), round(math.sin(a), 12)
+    if sign in "-^\\":
+        s = -s
+    if sign in "+-|":
+        now.h, now.l = _mixed(now.h, c, now.l, s), _mixed(now.l, c, now.h, -s)
+    elif sign in "&^":
+        now.h, now.u = _mixed(now.h, c, now.u, -s), _mixed(now.u, c, now.h, s)
+    else:
+        now.l, now.u = _mixed(now.l, c, now.u, s), _mixed(now.u, c, now.l, -s)
+
+
+def _level(now: _State) -> None:
+    """Roll until the left axis is horizontal; straight up or down it stays."""
+    x, y, _ = now.h
+    flat = math.sqrt(x * x + y * y)
+    if flat > 1e-9:
+        now.l = (-y / flat, x / flat, 0.0)
+        h, left = now.h, now.l
+        now.u = (
+            h[1] * left[2] - h[2] * left[1],
+            h[2] * left[0] - h[0] * left[2],
+            h[0] * left[1] - h[1] * left[0],
+        )

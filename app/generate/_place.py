@@ -1,0 +1,84 @@
+"""Where a site of a given size lies: at the origin, or inside the fence that its environment has."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.errors import CannotGenerate, Problem
+from app.generate._site import Site, angle, mm
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """The frame that a site was drawn in: its origin in local metres and its turn. sine, cosine: of the turn, rounded,
+    so that every machine puts everything at the same place."""
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+    sine: float = 0.0
+    cosine: float = 1.0
+
+    def at(self, u: float, v: float) -> tuple[float, float]:
+        """Local metres of a drawn place."""
+        return mm(self.x + self.cosine * u - self.sine * v), mm(self.y + self.sine * u + self.cosine * v)
+
+    def of(self, geometry: Any) -> Any:
+        """A drawn geometry in local metres."""
+        turn = np.array([[self.cosine, self.sine], [-self.sine, self.cosine]])
+
+        def moved(xy: Any) -> Any:
+            u, v = xy[:, :1], xy[:, 1:]
+            return np.round(u * turn[0] + v * turn[1] + np.array([self.x, self.y]), 3) + 0.0
+
+        return shapely.transform(geometry, moved)
+
+
+def placed(site: Site, width: float, depth: float, margin: float) -> Place:
+    """Bound the site to a rectangle of this size and a margin around it, or put it into the fence that is given.
+
+    The drawn rectangle reaches from (0, 0) to (width, depth). In a given fence it lies along the fence's longer side
+    where it fits, else along the axes. CannotGenerate where the fence has no room for it.
+    """
+    whole = shapely.box(-margin, -margin, width + margin, depth + margin)
+    fence = site.bounded(whole)
+    if not site.is_given:
+        return Place()
+    inside = shapely.prepare(fence)
+    del inside
+    for yaw in _turns(fence):
+        s, c = round(math.sin(yaw), 12), round(math.cos(yaw), 12)
+        for middle in _middles(fence):
+            x = middle[0] - (c * width - s * depth) / 2
+            y = middle[1] - (s * width + c * depth) / 2
+            place = Place(mm(x), mm(y), angle(yaw), s, c)
+            if shapely.contains(fence, place.of(whole)):
+                return place
+    need = f"{width + 2 * margin:.1f} × {depth + 2 * margin:.1f} m"
+    problem = f"the fence has no room for the site, which needs {need}: make the site smaller, or the fence wider"
+    raise CannotGenerate(problem, [Problem(problem, where="fence")])
+
+
+def _turns(fence: Any) -> list[float]:
+    """Directions to try: along the fence's longer side, across it, and the axes."""
+    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(fence))
+    if len(corners) < 4:
+        return [0.0]
+    a, b = corners[1] - corners[0], corners[2] - corners[1]
+    long = a if float(a @ a) >= float(b @ b) else b
+    yaw = math.atan2(float(long[1]), float(long[0]))
+    yaw = round(math.remainder(yaw, math.pi), 6)  # the long side, not upside down
+    return [yaw, yaw + math.pi / 2, 0.0, math.pi / 2]
+
+
+def _middles(fence: Any) -> list[tuple[float, float]]:
+    """Places to try for the middle: the fence's own, and that of the largest circle in it."""
+    circle = shapely.maximum_inscribed_circle(fence, tolerance=0.5)
+    box = shapely.minimum_rotated_rectangle(fence)
+    found = [shapely.centroid(box), shapely.centroid(fence), shapely.Point(shapely.get_coordinates(circle)[0])]
+    return [(round(p.x, 3), round(p.y, 3)) for p in found]

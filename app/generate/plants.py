@@ -1,0 +1,139 @@
+"""A stand of plants grown by L-systems, of a species that is known here or by rules of one's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import shapely
+
+from app.derive import Notes
+from app.errors import Invalid, Problem
+from app.generate import Source, _lsystem, _plants, generates
+from app.generate._place import placed
+from app.generate._site import Site, SiteOptions, disc, refused
+from app.model.layers import Layers
+from app.parameters import parameter
+
+COLOURS = {"apple": "crown", "vine": "leaf", "bush": "crown_light", "pine": "crown_dark"}
+HEADLAND = 3.0
+"""Metres between the plants and the fence, where robots turn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options(SiteOptions):
+    """Which plants, how many, and how far apart."""
+
+    species: Literal["apple", "vine", "bush", "pine"] = parameter("apple", "a species whose rules are known")
+    rules: str | None = parameter(
+        None,
+        "an L-system instead of a species, statements on lines of their own or between semicolons, such as: "
+        "axiom: !(0.05) F(0.5) A(1); A(l) : l > 0.2 -> F(l) [ +(30) A(l * 0.7) ] /(120) A(l * 0.8)",
+    )
+    iterations: int | None = parameter(
+        None, "rounds of rewriting; default: the species' own, or 6", minimum=0, maximum=_lsystem.MOST_ITERATIONS
+    )
+    angle: float = parameter(25.0, "of a turn for which the rules say none", minimum=-360.0, maximum=360.0, unit="°")
+    length: float = parameter(
+        0.1, "of a branch or leaf for which the rules say none", minimum=0.001, maximum=100.0, unit="m"
+    )
+    radius: float = parameter(0.01, "of a branch for which the rules say none", minimum=0.0005, maximum=10.0, unit="m")
+    body: Literal["trunk", "crown"] | None = parameter(
+        None, "what robots collide with: the trunk alone or nearly the whole plant; default: as the species is"
+    )
+    rows: int = parameter(4, "rows of plants", minimum=1, maximum=200)
+    columns: int = parameter(8, "plants in a row", minimum=1, maximum=200)
+    row_spacing: float | None = parameter(
+        None, "between rows; default: as much as the plants and a robot need", minimum=0.1, maximum=100.0, unit="m"
+    )
+    spacing: float | None = parameter(
+        None, "between the plants of a row; default: 1.1 times their width", minimum=0.05, maximum=100.0, unit="m"
+    )
+    jitter: float = parameter(0.1, "how far a plant may stand from its place", minimum=0.0, maximum=5.0, unit="m")
+    variants: int = parameter(
+        4, "different plants, which stand scaled and turned", minimum=1, maximum=_plants.MAX_VARIANTS
+    )
+    variation: float = parameter(
+        0.15, "by how much of its size a plant may be larger or smaller", minimum=0.0, maximum=0.5
+    )
+
+
+@generates(
+    {"location", "objects", "resources", "occupancy", "topology", "imagery"},
+    also=frozenset({"location"}),
+    parameters=Options,
+)
+def plants(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
+    """A stand of plants from L-systems: apple trees, vines, bushes, pines, or by rules of your own."""
+    grown = _grown(options, source)
+    largest = 1.0 + options.variation
+    body = max(p.body[0] for p in grown) * largest
+    width = 2 * max(p.spread for p in grown)
+    # One cell on each side of what a robot needs, since grids round obstacles up.
+    need = 2 * (body + options.jitter + options.robot_radius) + 4 * (options.resolution or 0.1) + 0.1
+    row_spacing = max(need, 1.1 * width) if options.row_spacing is None else options.row_spacing
+    if row_spacing < need:
+        raise refused("row_spacing", f"must be at least {need:.2f} m, so that a robot passes between the plants")
+    spacing = max(0.2, 1.1 * width) if options.spacing is None else options.spacing
+    head = max(HEADLAND, need)
+    site = Site(given, options, notes)
+    across, along = options.rows * row_spacing, (options.columns - 1) * spacing
+    place = placed(site, along + 2 * head, across, 1.0)
+    site.draw(site.fence, "meadow")
+    site.files.update(_plants.files_of(grown))
+    chance = source.stream("places")
+    for row in range(options.rows):
+        v = (row + 0.5) * row_spacing
+        strip = shapely.box(head - spacing / 2, v - body, head + along + spacing / 2, v + body)
+        site.draw(place.of(strip), "soil")
+        for column in range(options.columns):
+            du, dv, turn, size, which = chance.random(5).tolist()
+            plant = grown[int(which * len(grown))]
+            scale = round(1.0 + options.variation * (2.0 * size - 1.0), 3)
+            shift = options.jitter * 0.7  # so that no corner of the square lies farther off
+            x, y = place.at(head + column * spacing + shift * (2 * du - 1), v + shift * (2 * dv - 1))
+            radius, height = (round(part * scale, 3) for part in plant.body)
+            site.put(
+                f"plant_{row + 1}_{column + 1}",
+                plant.kind,
+                shapely.Point(x, y),
+                shapes=plant.shapes(scale),
+                pose=(x, y, 0.0, 6.283185 * turn),
+                width=round(2 * radius, 3),
+                height=height,
+                species=plant.name.rpartition("_")[0],
+                colour=COLOURS.get(options.species, "crown"),
+                seen=disc(x, y, max(plant.spread * scale, radius)),
+            )
+    for aisle in range(options.rows + 1):
+        v = aisle * row_spacing
+        ends = [(head / 2, "west"), (head * 1.5 + along, "east")]
+        names = [site.node(f"aisle_{aisle + 1}_{side}", place.at(u, v), yaw=place.yaw) for u, side in ends]
+        site.way(*names, speed=1.0)
+        if aisle:
+            for side in ("west", "east"):
+                site.way(f"aisle_{aisle}_{side}", f"aisle_{aisle + 1}_{side}", speed=1.0)
+    return site.finish(ground="meadow")
+
+
+def _grown(options: Options, source: Source) -> list[_plants.Plant]:
+    """The plants that stand here. Invalid and CannotGenerate say what is wrong with rules."""
+    name: str = options.species if options.rules is None else "own"
+    if options.rules is None:
+        known = _plants.SPECIES[options.species]
+    elif options.rules.strip():
+        known = _plants.Species("plant", options.rules, 6)
+    else:
+        raise Invalid("rules: there are none", [Problem("there are none", where="rules")])
+    species = replace(
+        known,
+        iterations=known.iterations if options.iterations is None else options.iterations,
+        body=options.body or known.body,
+    )
+    system = _lsystem.parse(species.rules)
+    budget = _lsystem.Budget()
+    measures = {"angle": options.angle, "length": options.length, "radius": options.radius}
+    return [
+        _plants.grow(system, species, f"{name}_{k + 1}", source.stream(f"plant/{name}/{k}"), budget, **measures)
+        for k in range(options.variants)
+    ]

@@ -1,0 +1,144 @@
+"""What every made-up site must hold to: one check each, for the tests of single sites."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import orjson
+import pytest
+import shapely
+
+from app import formats, generate
+from app.convert import written
+from app.derive import Notes
+from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
+from app.formats import Group, ReadContext
+from app.generate import _site
+from app.model.features import Features
+from app.model.grid import FREE, OCCUPIED, OccupancyGrid
+from app.model.imagery import Picture
+from app.model.layers import Layers, Resources
+from app.store.values import Provenance
+from tests.api.conftest import Api
+
+CAME = Provenance("generated")
+
+
+def make(name: str, seed: int = 7, given: Layers | None = None, **values: Any) -> tuple[Layers, Notes]:
+    """A site and what its generator said."""
+    notes = Notes()
+    return generate.run(name, seed, values, given or Layers(), notes), notes
+
+
+def digest(layers: Layers) -> str:
+    """A hash of all that was made but its picture, whose colours are a matter of taste."""
+    out = hashlib.sha256()
+    for key, part in sorted(layers.parts.items()):
+        out.update(orjson.dumps([key.layer, key.level, key.name]))
+        if isinstance(part, Features):
+            out.update(orjson.dumps([part.ids, part.properties, part.document], option=orjson.OPT_SORT_KEYS))
+            out.update(b"".join(shapely.to_wkb(part.geometry, byte_order=1)))
+        elif isinstance(part, OccupancyGrid):
+            out.update(orjson.dumps([part.resolution, part.origin]) + part.cells.tobytes())
+        elif isinstance(part, Resources):
+            for path, data in sorted(part.files.items()):
+                out.update(path.encode() + data)
+        else:
+            assert isinstance(part, Picture)
+    return out.hexdigest()
+
+
+def agrees_with_itself(layers: Layers, radius: float, height: float = 0.2) -> None:
+    """Free space in one piece, edges in free space only, the network in one piece, the world's slice the grid."""
+    grids = layers.grids()
+    assert grids
+    for grid in grids.values():
+        free = (grid.cells == FREE).astype(np.uint8)
+        assert cv2.connectedComponents(free, connectivity=4)[0] == 2, "free space is one piece"
+    levels: dict[str, str] = {}
+    ways: list[tuple[str, str]] = []
+    for key, part in layers.vector("topology").items():
+        lines = [g for g, p in zip(part.geometry, part.properties, strict=True) if p["kind"] == "edge"]
+        ends = [(p["source"], p["target"]) for p in part.properties if p["kind"] == "edge"]
+        levels |= {i: key.level for i, p in zip(part.ids, part.properties, strict=True) if p["kind"] == "node"}
+        ways += ends
+        grid = next(g for k, g in grids.items() if k.level == key.level)
+        assert _site.passable(grid, lines, radius).all(), "no edge leads through an obstacle"
+    near = {name: {b for a, b in ways if a == name} for name in levels}
+    seen = set(list(levels)[:1])
+    waiting = list(seen)
+    while waiting:
+        fresh = near[waiting.pop()] - seen
+        seen |= fresh
+        waiting += fresh
+    assert seen == set(levels), "every node can be reached, over all levels"
+    world(layers, height)
+
+
+def world(layers: Layers, height: float) -> None:
+    """The world as Gazebo gets it, cut above each level's floor, is the level's grid."""
+    files = written(layers, "gazebo", {}, CAME).files
+    read = formats.read(Group(formats.get_format("gazebo"), "world.sdf", files), ReadContext())
+    fence = {k: p for k, p in layers.parts.items() if k.layer == "location"}
+    for key, grid in layers.grids().items():
+        cut = Parameters(height=round(layers.elevation(key.level) + height, 3), resolution=grid.resolution)
+        (again,) = objects_to_occupancy(Layers({**read.parts, **fence}, layers.datum), cut, Notes()).grids().values()
+        assert again.cells.shape == grid.cells.shape
+        ours, theirs = grid.cells == OCCUPIED, again.cells == OCCUPIED
+        assert (ours == theirs).mean() >= 0.99
+        assert (ours & theirs).sum() >= 0.99 * (ours | theirs).sum(), "and so are its obstacles alone"
+
+
+def sound_sdf(layers: Layers, folder: Path) -> None:
+    """The written world passes libsdformat's own check."""
+    tool = shutil.which("ign")
+    if tool is None:
+        pytest.skip("ign is not installed")
+    for name, data in written(layers, "gazebo", {}, CAME).files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    told = subprocess.run(
+        [tool, "sdf", "--check", str(folder / "world.sdf")], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert told.returncode == 0, told.stdout + told.stderr
+    assert "Valid" in told.stdout
+
+
+def serves(layers: Layers) -> dict[str, list[dict[str, Any]]]:
+    """What each format leaves out; every one serves from the site, and nothing it writes would be refused."""
+    out = {}
+    for name, known in formats.all_formats().items():
+        if known.write is None:
+            continue
+        made = written(layers, name, {}, CAME)
+        assert made.files, name
+        errors = [w for w in made.report["warnings"] if w.get("level") == "error"]
+        assert not errors, (name, errors)
+        out[name] = made.report["dropped"]
+    return out
+
+
+def over_http(api: Api, name: str, formats_: tuple[str, ...], **values: Any) -> dict[str, Any]:
+    """Generate through the API, serve some formats, and upload what was served to another environment."""
+    env = f"made-{name}"
+    api.post("environments", {"name": env})
+    body = {"generator": name, "seed": 7, "parameters": values}
+    version: dict[str, Any] = api.post(f"environments/{env}/generations", body).json()
+    assert api.post(f"environments/{env}/generations", body, expect=200).json()["version"] is not None
+    states = {row["format"]: row["state"] for row in api.get(f"environments/{env}/versions/latest/maps").json()}
+    assert set(states.values()) <= {"direct", "derivable"}, states
+    api.post("environments", {"name": f"{env}-back", "datum": version.get("datum")})
+    for wanted in formats_:
+        answer = api.get(f"environments/{env}/versions/latest/maps/{wanted}")
+        inside = answer.headers.get("content-disposition", "")
+        file = "map.zip" if "zip" in answer.headers["content-type"] else inside.rpartition("filename=")[2].strip('"')
+        told = api.upload(f"{env}-back", {file or "map": answer.content}, format=wanted).json()
+        assert told["version"], wanted
+    return version

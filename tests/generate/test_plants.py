@@ -1,0 +1,91 @@
+"""A stand of plants: what it agrees in, what is served from it, and rules that people bring along."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import shapely
+
+from app.convert import written
+from app.errors import CannotGenerate, Invalid
+from app.model.features import features
+from app.model.frame import GROUND, Datum
+from app.model.layers import Layers, PartKey
+from tests.api.conftest import Api
+from tests.generate import looks
+
+DIGEST = "87eeff483ded9d36ca488e3f8bf9f2aadc1dce9c523b322939c9189a799e715d"
+
+
+def test_a_stand_agrees_with_itself_and_every_format_serves_from_it(tmp_path: Path) -> None:
+    made, _ = looks.make("plants", variants=2, columns=4)
+    looks.agrees_with_itself(made, 0.3)
+    looks.sound_sdf(made, tmp_path)
+    looks.serves(made)
+    assert looks.digest(made) == DIGEST
+    assert looks.digest(looks.make("plants", 8, variants=2, columns=4)[0]) != DIGEST
+
+
+@pytest.mark.parametrize("species", ["vine", "bush", "pine"])
+def test_each_species(species: str) -> None:
+    made, _ = looks.make("plants", species=species, rows=2, columns=2, variants=1)
+    looks.agrees_with_itself(made, 0.3)
+    objects = made.vector("objects")[PartKey("objects", GROUND, "generated")]
+    assert len(objects) == 4
+    files = written(made, "gazebo", {}, looks.CAME).files
+    assert {f for f in files if f.endswith(".obj")} == set(made.resources()), "the meshes go along"
+
+
+def test_rules_of_ones_own() -> None:
+    rules = "axiom: !(0.05) F(0.5) A(1); A(l) : l > 0.3 -> F(l) [ +(30) A(l * 0.7) ] [ -(30) A(l * 0.7) ] L(0.2)"
+    made, _ = looks.make("plants", rules=rules, rows=1, columns=2, variants=1, body="crown", jitter=0)
+    looks.agrees_with_itself(made, 0.3)
+    assert set(made.resources()) == {"models/own_1/meshes/wood.obj", "models/own_1/meshes/leaves.obj"}
+    (first, _) = made.vector("objects")[PartKey("objects", GROUND, "generated")].properties
+    assert first["shapes"][0]["type"] == "cylinder"
+    assert first["shapes"][0]["radius"] > 0.3, "a crown, not the trunk of 0.05 m"
+
+
+def test_inside_a_fence() -> None:
+    fence = features([("f", shapely.Polygon([(0, 0), (60, 60), (40, 80), (-20, 20)]), {"kind": "fence"})], "local")
+    given = Layers({PartKey("location", GROUND, "site"): fence}, Datum(53.0, -0.5))
+    made, _ = looks.make("plants", given=given, rows=3, columns=4, variants=1)
+    assert made.datum == given.datum
+    for part in (*made.vector("objects").values(), *made.vector("topology").values()):
+        assert shapely.contains(fence.geometry[0], part.geometry).all()
+    with pytest.raises(CannotGenerate, match="the fence has no room for the site, which needs"):
+        looks.make("plants", given=given, rows=50)
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ({"rules": "axiom: F; F -> FFFFFFFFFFFFFFFFFFFF", "iterations": 40}, "more than 100000 symbols after 3 of 40"),
+        ({"rules": "axiom: A; A -> B; B -> A"}, "draws no branch"),
+        ({"rules": "axiom: Q"}, "no rule says what becomes of Q"),
+        ({"rules": " "}, "there are none"),
+        ({"species": "oak"}, "must be one of apple, vine, bush, pine"),
+        ({"rows": 0}, "at least 1"),
+        ({"columns": 10**9}, "at most 200"),
+        ({"iterations": 10**9}, "at most 40"),
+        ({"row_spacing": 0.2}, r"row_spacing: must be at least 1\.\d\d m"),
+        ({"rows": 200, "columns": 200, "spacing": 100, "row_spacing": 100, "resolution": 0.01}, "coarser resolution"),
+    ],
+)
+def test_what_cannot_be_made_is_told(values: dict[str, Any], why: str) -> None:
+    with pytest.raises((CannotGenerate, Invalid), match=why):
+        looks.make("plants", **values)
+
+
+def test_over_http(api: Api) -> None:
+    wanted = ("gazebo", "occupancy_grid", "tmap2", "kml", "osm", "geojson", "octomap")
+    version = looks.over_http(api, "plants", wanted, rows=2, columns=3, variants=1)
+    assert version["information"]["objects"] == "generated"
+    detail = api.problem(
+        "POST", "environments/made-plants/generations", 422,
+        json={"generator": "plants", "seed": 1, "parameters": {"rules": "axiom: F; F -> FF", "iterations": 40}},
+    )  # fmt: skip
+    assert "the L-system has more than 100000 symbols" in detail["detail"]
+    assert detail["errors"][0]["where"] == "rules"
