@@ -201,6 +201,8 @@ class Agent:
         ours = {self.options.channel} if self.options.channel else {PRODUCTION, channel}
         if event.type == "version.created":
             concerns = channel in (LATEST, None)
+        elif event.type.startswith("overlay."):
+            concerns = False  # what is accepted of them comes as a version
         else:
             concerns = event.channel in ours or event.type.startswith("environment.")
         if concerns:

@@ -1,10 +1,10 @@
-"""Overlays: robots report what is blocked, editors decide on it."""
+"""Overlays: robots report what is blocked, editors decide on it; each step is an event (``overlay.…``)."""
 
 from __future__ import annotations
 
 import logging
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query
 from starlette.responses import Response
@@ -24,23 +24,6 @@ log = logging.getLogger(__name__)
 router = APIRouter(prefix="/environments/{env}/overlays", tags=["overlays"], route_class=Route)
 
 
-def as_dict(overlay: Overlay) -> dict[str, Any]:
-    """The overlay as clients see it, without its empty members."""
-    out: dict[str, Any] = {"id": overlay.id, "environment": overlay.environment, "kind": overlay.kind}
-    out |= {"state": overlay.state, "level": overlay.level, "reporter": overlay.reporter}
-    out |= {"created": rfc3339(overlay.created), "expires": rfc3339(overlay.expires)}
-    more: dict[str, Any] = {
-        "polygon": overlay.polygon,
-        "edge": overlay.edge,
-        "crs": overlay.crs,
-        "detail": overlay.detail,
-        "decided_by": overlay.decided_by,
-        "decided": rfc3339(overlay.decided) if overlay.decided else None,
-        "version": overlay.version,
-    }
-    return out | {name: value for name, value in more.items() if value is not None}
-
-
 @router.get("", responses=told(list[OverlayOut], 404), summary="What is reported as blocked")
 def list_overlays(
     env: EnvironmentPath,
@@ -52,7 +35,7 @@ def list_overlays(
     ] = None,
 ) -> Response:
     """Oldest first. `pending` waits for a decision, `expired` was never decided on, `ended` was taken out again."""
-    return answer([as_dict(overlay) for overlay in here.store.overlays(env, state)])
+    return answer([overlay.as_dict() for overlay in here.store.overlays(env, state)])
 
 
 @router.post(
@@ -88,7 +71,7 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, here: Here, who: Rep
     )
     edit_changes(here.store, head, overlays.accepting(here.store, head, wanted))  # Invalid now, not for the editor
     overlay, new = here.store.add_overlay(wanted)
-    return answer(as_dict(overlay), 201 if new else 200)
+    return answer(overlay.as_dict(), 201 if new else 200)
 
 
 @router.post(
@@ -109,13 +92,14 @@ def accept_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Edito
     except FleetMapError:
         here.store.decide_overlay(env, id, "accepted", "pending", who.name, now)
         raise
-    return answer(as_dict(here.store.note_overlay_version(env, id, version)))
+    return answer(here.store.note_overlay_version(env, id, version).as_dict())
 
 
 @router.post("/{id}/reject", responses=told(OverlayOut, 404, 409), summary="Reject an overlay")
 def reject_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
     """It stays in the list, and nothing changes."""
-    return answer(as_dict(here.store.decide_overlay(env, id, "pending", "rejected", who.name, datetime.now(UTC))))
+    decided = here.store.decide_overlay(env, id, "pending", "rejected", who.name, datetime.now(UTC))
+    return answer(decided.as_dict())
 
 
 def _edit(here: Services, overlay: Overlay, *, ending: bool, author: str) -> int:

@@ -18,7 +18,18 @@ JSON = "application/json"
 SIGNATURE = "fleetmap-signature"
 """Header of a manifest: ``<key id>:<base64 of the Ed25519 signature over the body>``."""
 
-EventType = Literal["version.created", "channel.planned", "channel.moved", "environment.created", "environment.deleted"]
+EventType = Literal[
+    "version.created",
+    "channel.planned",
+    "channel.moved",
+    "environment.created",
+    "environment.deleted",
+    "overlay.created",
+    "overlay.accepted",
+    "overlay.rejected",
+    "overlay.expired",
+    "overlay.ended",
+]
 EVENT_TYPES: tuple[EventType, ...] = get_args(EventType)
 
 RobotState = Literal["downloading", "ready", "active", "failed"]

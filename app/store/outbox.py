@@ -15,7 +15,18 @@ from app.store.values import Event, PartEntry, rfc3339
 REACH = 100_000
 """So far back in the log the last events of environments are looked for."""
 
-EventType = Literal["version.created", "channel.planned", "channel.moved", "environment.created", "environment.deleted"]
+EventType = Literal[
+    "version.created",
+    "channel.planned",
+    "channel.moved",
+    "environment.created",
+    "environment.deleted",
+    "overlay.created",
+    "overlay.accepted",
+    "overlay.rejected",
+    "overlay.expired",
+    "overlay.ended",
+]
 
 
 def layer_changes(before: Sequence[PartEntry], after: Sequence[PartEntry]) -> list[dict[str, Any]]:

@@ -1,22 +1,36 @@
-"""Overlays: what robots report as blocked for a time, until an editor decides on it."""
+"""Overlays: what robots report as blocked for a time, until an editor decides on it. Each step is an event.
+
+An accepted overlay is told of (``overlay.accepted``) when the version that it went into is known, after that version's
+own event. Who follows overlays goes by events, not by ``expires``: reported again, the end moves without an event.
+"""
 
 from __future__ import annotations
 
 import secrets
-from datetime import datetime
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import datetime, timedelta
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, func, insert, select, update
+from sqlalchemy import Connection, Row, func, insert, or_, select, update
 
 from app.errors import Conflict, NotFound
-from app.store import tables
-from app.store.base import Base, environment_row, text
+from app.store import outbox, tables
+from app.store.base import Base, environment_row, text, utcnow
 from app.store.values import Overlay, OverlayState
 
 MAX_PENDING: Final = 1000
 """So many overlays of an environment may wait for a decision."""
 
 MAX_LISTED: Final = 10_000
+TOLD: Final[Mapping[OverlayState, outbox.EventType]] = {"rejected": "overlay.rejected", "ended": "overlay.ended"}
+"""What deciding tells. An acceptance is told once its version is known."""
+
+LOST_AFTER: Final = timedelta(seconds=60)
+"""An acceptance that has named no version after so long was cut off: it may stand in one all the same."""
+
+AT_ONCE: Final = 100
+"""Overlays that are ended in one go."""
 
 
 class Overlays(Base):
@@ -29,7 +43,7 @@ class Overlays(Base):
         environment, Conflict where too many wait.
         """
         table = tables.overlay
-        with self._database.write(tell=False) as connection:
+        with self._database.write() as connection:
             row = environment_row(connection, wanted.environment, lock=True)
             pending = (table.c.environment_id == row.id, table.c.state == "pending")
             own = select(table).where(*pending, table.c.reporter == wanted.reporter, table.c.expires > wanted.created)
@@ -59,7 +73,9 @@ class Overlays(Base):
                     expires=wanted.expires,
                 )
             )
-            return _read(connection, row, new), True
+            made = _read(connection, row, new)
+            _tell(connection, row, made, "overlay.created", made.reporter, made.created)
+            return made, True
 
     def overlays(self, environment: str, state: OverlayState | None = None) -> list[Overlay]:
         """An environment's overlays, oldest first; NotFound."""
@@ -81,7 +97,7 @@ class Overlays(Base):
     ) -> Overlay:
         """Change its state; Conflict where it is not (or no longer) in the state ``before``."""
         table = tables.overlay
-        with self._database.write(tell=False) as connection:
+        with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
             known = _read(connection, row, id)
             if known.state != before:
@@ -90,42 +106,68 @@ class Overlays(Base):
             if state == "pending":
                 values |= {"decided_by": None, "decided": None}
             connection.execute(update(table).where(table.c.id == id).values(values))
-            return _read(connection, row, id)
+            decided = _read(connection, row, id)
+            if (kind := TOLD.get(state)) is not None:
+                _tell(connection, row, decided, kind, author, now)
+            return decided
 
     def note_overlay_version(self, environment: str, id: str, version: int) -> Overlay:
-        """The version that an accepted overlay went into."""
+        """The version that an accepted overlay went into: now it is told of."""
         table = tables.overlay
-        with self._database.write(tell=False) as connection:
-            row = environment_row(connection, environment)
-            connection.execute(
-                update(table).where(table.c.id == id, table.c.environment_id == row.id).values(version=version)
-            )
-            return _read(connection, row, id)
+        with self._database.write() as connection:
+            row = environment_row(connection, environment, lock=True)
+            before = _read(connection, row, id)
+            connection.execute(update(table).where(table.c.id == id).values(version=version))
+            noted = _read(connection, row, id)
+            if before.version is None and noted.state == "accepted":
+                _tell(connection, row, noted, "overlay.accepted", noted.decided_by or "", utcnow())
+            return noted
 
     def expire_overlays(self, now: datetime) -> list[Overlay]:
         """Pending overlays whose time is over expire. Accepted ones whose time is over: to be taken out by the caller,
         who then ends them with ``decide_overlay``.
         """
         table, owner = tables.overlay, tables.environment
-        over = table.c.expires <= now
+        joined = select(table, owner.c.name.label("environment")).join(owner, owner.c.id == table.c.environment_id)
+        over = joined.where(table.c.expires <= now, owner.c.deleted.is_(None)).order_by(table.c.expires, table.c.id)
+        over = over.limit(AT_ONCE)
         with self._database.read() as connection:
-            pending = connection.execute(
-                select(table.c.id).where(table.c.state == "pending", over).limit(1)
-            ).scalar_one_or_none()
-            query = (
-                select(table, owner.c.name.label("environment"))
-                .join(owner, owner.c.id == table.c.environment_id)
-                .where(table.c.state == "accepted", over, table.c.version.is_not(None), owner.c.deleted.is_(None))
-                .order_by(table.c.expires, table.c.id)
-                .limit(100)
-            )
-            accepted = [_as_overlay(r.environment, r) for r in connection.execute(query)]
-        if pending is not None:
-            with self._database.write(tell=False) as connection:
-                connection.execute(
-                    update(table).where(table.c.state == "pending", over).values(state="expired", decided=now)
-                )
-        return accepted
+            pending = connection.execute(over.where(table.c.state == "pending")).all()
+            whole = or_(table.c.version.is_not(None), table.c.decided < now - LOST_AFTER)
+            accepted = connection.execute(over.where(table.c.state == "accepted", whole)).all()
+        for found in pending:
+            with suppress(NotFound), self._database.write() as connection:
+                row = environment_row(connection, found.environment, lock=True)
+                known = _read(connection, row, found.id)
+                if known.state == "pending" and known.expires <= now:  # else somebody was quicker
+                    connection.execute(update(table).where(table.c.id == found.id).values(state="expired", decided=now))
+                    _tell(connection, row, _read(connection, row, found.id), "overlay.expired", "", now)
+        return [_as_overlay(r.environment, r) for r in accepted]
+
+
+def _tell(
+    connection: Connection, environment: Row[Any], overlay: Overlay, kind: outbox.EventType, author: str, now: datetime
+) -> None:
+    """The event of one step. version and root are the head's; the environment's row is locked and as it is stored."""
+    sequence = environment.sequence + 1
+    owner = tables.environment
+    connection.execute(update(owner).where(owner.c.id == environment.id).values(sequence=sequence))
+    what = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
+    outbox.append(
+        connection,
+        environment_id=environment.id,
+        environment=environment.name,
+        sequence=sequence,
+        kind=kind,
+        version=environment.head,
+        root=environment.root,
+        previous=None,
+        layers=[],
+        message=f"{what}, reported as {overlay.kind}" + (f": {overlay.detail}" if overlay.detail else ""),
+        author=author,
+        time=now,
+        overlay=overlay.as_dict(),
+    )
 
 
 def _read(connection: Connection, environment: Row[Any], id: str) -> Overlay:

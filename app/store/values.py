@@ -463,6 +463,22 @@ class Overlay:
     decided: datetime | None = None
     version: int | None = None
 
+    def as_dict(self) -> dict[str, Any]:
+        """The overlay as clients see it, without its empty members."""
+        out: dict[str, Any] = {"id": self.id, "environment": self.environment, "kind": self.kind}
+        out |= {"state": self.state, "level": self.level, "reporter": self.reporter}
+        out |= {"created": rfc3339(self.created), "expires": rfc3339(self.expires)}
+        more: dict[str, Any] = {
+            "polygon": self.polygon,
+            "edge": self.edge,
+            "crs": self.crs,
+            "detail": self.detail,
+            "decided_by": self.decided_by,
+            "decided": rfc3339(self.decided) if self.decided else None,
+            "version": self.version,
+        }
+        return out | {name: value for name, value in more.items() if value is not None}
+
 
 @dataclass(frozen=True, slots=True)
 class FeatureDelta:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import time
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
 
+from app.api.overlays import end_overlays
 from app.errors import Unavailable
+from app.events.messages import Event
 from tests.api.conftest import Api
 
 SQUARE = {"type": "Polygon", "coordinates": [[[1, 1], [4, 1], [4, 3], [1, 3], [1, 1]]]}
@@ -24,6 +28,14 @@ def zones(api: Api, env: str) -> list[dict[str, Any]]:
         "features"
     ]
     return found
+
+
+def told_of(api: Api, env: str) -> list[dict[str, Any]]:
+    """The events after the farm's own, as a client reads them."""
+    lines = api.get(f"events?environment={env}&since=4&follow=false").text.splitlines()
+    events = [json.loads(line[5:]) for line in lines if line.startswith("data:")]
+    assert [e["sequence"] for e in events] == list(range(5, 5 + len(events)))
+    return events
 
 
 def until(condition: Any) -> Any:
@@ -62,6 +74,16 @@ def test_a_blocked_polygon_becomes_a_keepout_and_goes_again(api: Api, farm: str)
     assert zones(api, farm) == []
     assert api.get(f"environments/{farm}").json()["version"] == 5
     assert api.get(f"{url}?state=pending").json() == []
+    events = told_of(api, farm)
+    assert [(e["type"], e["version"]) for e in events] == [
+        ("overlay.created", 3), ("version.created", 4), ("overlay.accepted", 4), ("version.created", 5),
+        ("overlay.ended", 5),
+    ]  # fmt: skip
+    assert events[0]["overlay"] == told
+    assert (events[0]["author"], events[0]["layers"], events[0]["previous"]) == ("mower-7", [], None)
+    assert events[2]["overlay"] == accepted
+    assert events[2]["root"] == events[1]["root"] == api.get(f"environments/{farm}/versions/4").json()["root"]
+    assert events[4]["overlay"]["state"] == "ended"
 
 
 def test_a_blocked_edge(api: Api, farm: str) -> None:
@@ -88,6 +110,33 @@ def test_undecided_overlays_expire(api: Api, farm: str) -> None:
     assert api.post(f"{url}/{other['id']}/reject", expect=200).json()["state"] == "rejected"
     api.problem("POST", f"{url}/{other['id']}/accept", 409)
     assert [o["state"] for o in api.get(url).json()] == ["expired", "rejected"]
+    kinds = [(e["type"], e["overlay"]["id"]) for e in told_of(api, farm)]
+    assert kinds == [
+        ("overlay.created", told["id"]), ("overlay.expired", told["id"]),
+        ("overlay.created", other["id"]), ("overlay.rejected", other["id"]),
+    ]  # fmt: skip
+    assert Event.from_json(json.dumps(told_of(api, farm)[1])).type == "overlay.expired"
+
+
+def test_an_acceptance_that_was_cut_off_ends_as_well(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """kill -9 after the version and before it was noted: the edge does not stay blocked."""
+    url = f"environments/{farm}/overlays"
+    before = edge(api, farm, "gate_barn")
+    told = api.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": 2}).json()
+    store = api.app.state.services.store
+
+    def cut_off(*_: Any) -> Any:
+        raise Unavailable("gone")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(store), "note_overlay_version", cut_off)
+        api.problem("POST", f"{url}/{told['id']}/accept", 503)
+    assert edge(api, farm, "gate_barn")["properties"]["blocked"] is True
+    later = datetime.now(UTC) + timedelta(seconds=50)
+    assert told["id"] not in {o.id for o in store.expire_overlays(later)}, "somebody may be at it"
+    end_overlays(api.app.state.services, datetime.now(UTC) + timedelta(seconds=70))
+    assert edge(api, farm, "gate_barn") == before
+    assert [o["state"] for o in api.get(url).json()] == ["ended"]
 
 
 def test_a_zone_that_an_editor_removed_is_not_missed(api: Api, farm: str) -> None:
