@@ -5,14 +5,17 @@ Import the fixtures in a conftest.py: ``from tests.postgres import postgres_clus
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pwd
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
+import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,11 +29,37 @@ FOLDERS = ("/usr/local/bin", *(f"/usr/lib/postgresql/{n}/bin" for n in range(20,
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """A running server: one superuser, trusted on the loopback address."""
+    """A running server: one superuser, trusted on the loopback address. run: a command as the server's user."""
 
     port: int
     bin: Path
     data: Path
+    run: Callable[..., subprocess.CompletedProcess[str]]
+
+    def start(self) -> subprocess.CompletedProcess[str]:
+        """Start it, and wait until it answers."""
+        home = self.data.parent
+        options = f"-p {self.port} -c listen_addresses=127.0.0.1 -c unix_socket_directories='{home}'"
+        options += " -c max_connections=80 -c fsync=off"  # its files outlive its processes; tests cut no power
+        command = [str(self.bin / "pg_ctl"), "-D", str(self.data), "-w", "-t", "60", "-l", str(home / "log")]
+        return self.run(*command, "-o", options, "start")
+
+    def kill(self) -> None:
+        """kill -9 of all its processes, as a machine does that runs out of memory."""
+        postmaster = int((self.data / "postmaster.pid").read_text().split()[0])
+        children = subprocess.run(["pgrep", "-P", str(postmaster)], capture_output=True, text=True, check=False)
+        for process in (postmaster, *map(int, children.stdout.split())):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+
+    def restart(self) -> None:
+        """Start it after ``kill``; until its last process is gone it refuses."""
+        for _ in range(50):
+            started = self.start()
+            if started.returncode == 0:
+                return
+            time.sleep(0.1)
+        pytest.fail(f"PostgreSQL does not start again: {started.stdout}{started.stderr}")
 
     def url(self, database: str = "postgres") -> str:
         """For SQLAlchemy."""
@@ -128,34 +157,15 @@ def running_cluster() -> Iterator[Cluster]:
         made = run(str(folder / "initdb"), "-D", str(data), "-U", "fleetmap", "-A", "trust", "-E", "UTF8", "--no-sync")
         if made.returncode:
             pytest.fail(f"initdb failed: {made.stderr}")
-        started = None
-        port = 0
         for _ in range(5):
-            port = _free_port()
-            options = (
-                f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories='{home}' -c max_connections=80"
-            )
-            started = run(
-                str(folder / "pg_ctl"),
-                "-D",
-                str(data),
-                "-w",
-                "-t",
-                "60",
-                "-l",
-                str(home / "log"),
-                "-o",
-                options,
-                "start",
-            )
+            cluster = Cluster(_free_port(), folder, data, run)
+            started = cluster.start()
             if started.returncode == 0:
                 break
-        assert started is not None
         if started.returncode:
             log = (home / "log").read_text(errors="replace") if (home / "log").exists() else ""
             pytest.fail(f"PostgreSQL does not start: {started.stdout}{started.stderr}{log}")
         try:
-            cluster = Cluster(port, folder, data)
             with cluster.connect() as connection:
                 known = connection.execute("SELECT 1 FROM pg_available_extensions WHERE name = 'postgis'").fetchone()
                 if known is None:

@@ -127,7 +127,14 @@ async def _stream(
         quiet = 0.0
         loop = asyncio.get_running_loop()
         while True:
-            page = await run_in_threadpool(here.store.events, environment, start, PAGE)
+            try:
+                page = await run_in_threadpool(here.store.events, environment, start, PAGE)
+            except Unavailable:  # the log is still there when the database is back
+                yield b": the database is away\n\n"
+                await asyncio.sleep(POLL_SECONDS)
+                continue
+            except NotFound:
+                return  # purged: whoever asks again is told so
             for event in page:
                 start = event.sequence if environment is not None else event.position
                 if environment is not None or who.may_enter(event.environment):

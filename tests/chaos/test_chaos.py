@@ -1,0 +1,150 @@
+"""kill -9 of server, router and database at random moments, in the middle of commits, of the relay and of downloads.
+
+Each is killed FLEETMAP_CHAOS times (10, ``make chaos``: 50), shared out to two worlds: PostgreSQL with the server's own
+router, and SQLite with a separate router. FLEETMAP_CHAOS_SEED names another order of moments.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from tests.chaos.world import ANY, COMMIT, DOWNLOAD, ENVIRONMENT, RELAY, Fleet, World, fleet_of
+from tests.events.conftest import eventually
+from tests.postgres import Cluster, postgres_cluster
+
+__all__ = ["postgres_cluster"]
+
+KILLS = int(os.environ.get("FLEETMAP_CHAOS", "10"))
+SEED = int(os.environ.get("FLEETMAP_CHAOS_SEED", "5"))
+SECONDS_A_KILL = 30
+
+pytestmark = pytest.mark.timeout(240 + 3 * KILLS * SECONDS_A_KILL)
+
+
+@pytest.mark.postgres
+def test_postgresql_and_the_servers_own_router(tmp_path: Path, postgres_cluster: Cluster) -> None:
+    each = {"server": KILLS - KILLS // 2, "router": KILLS - KILLS // 2, "database": KILLS}
+    with fleet_of(tmp_path, postgres_cluster, own_router=True, seed=SEED) as fleet:
+        havoc(fleet, each)
+        check(fleet)
+
+
+def test_sqlite_and_a_separate_router(tmp_path: Path) -> None:
+    each = {"server": KILLS // 2, "router": KILLS // 2}
+    with fleet_of(tmp_path, None, own_router=False, seed=SEED + 100) as fleet:
+        havoc(fleet, each)
+        check(fleet)
+
+
+def havoc(fleet: Fleet, each: dict[str, int]) -> None:
+    """Kill each so many times, in a random order, aimed at each phase in turn."""
+    world, dice = fleet.world, random.Random(SEED)
+    order = [target for target, count in each.items() for _ in range(count)]
+    dice.shuffle(order)
+    aims = {target: [COMMIT, RELAY, DOWNLOAD, ANY] for target in each}
+    met: Counter[tuple[str, str]] = Counter()
+    for target in order:
+        aim = aims[target].pop(0)
+        aims[target].append(aim)
+        fleet.wait_for(aim)
+        met.update((target, phase) for phase in fleet.under_way())
+        getattr(world, f"kill_{target}")()
+        time.sleep(dice.choice((0.0, 0.0, 0.1, 0.5)))
+        getattr(world, f"revive_{target}")()
+        before = fleet.made()
+        if dice.random() < 0.7:  # else the next one comes while it is still coming up
+            eventually(lambda n=before: fleet.made() > n, 60)
+        if dice.random() < 0.3:  # some quiet, so that robots get on
+            lines = [len(robot.lines) for robot in fleet.robots]
+            eventually(lambda at=lines: any(r.saw("switched", n) for r, n in zip(fleet.robots, at, strict=True)), 60)
+    print(f"killed {dict(Counter(order))}; under way then: { {f'{t} {p}': n for (t, p), n in sorted(met.items())} }")
+    for phase in (COMMIT, RELAY, DOWNLOAD) if len(order) >= 10 else ():
+        assert any(count for (_, p), count in met.items() if p == phase), f"no kill came in the middle of a {phase}"
+
+
+def check(fleet: Fleet) -> None:
+    """What must hold after it all."""
+    world = fleet.world
+    head = fleet.settle()
+    fleet.watcher.stop()
+    check_versions(fleet, head["version"])
+    events = _events(world)
+    last = events[-1]["sequence"]
+    assert [event["sequence"] for event in events] == list(range(1, last + 1)), "the log has a gap"
+    created = [event["version"] for event in events if event["type"] == "version.created"]
+    assert created == list(range(1, head["version"] + 1)), "an event is missing, or told twice"
+    whole = list(range(1, last + 1))
+    eventually(lambda: fleet.reader.sequences[-1:] == [last], 30)
+    assert fleet.reader.sequences == whole, "server-sent events: a gap or a repeat"
+    eventually(lambda: fleet.listener.sequences()[-1:] == [last], 30)
+    assert fleet.listener.sequences() == whole, "Zenoh: a gap"
+    check_robots(fleet, head)
+
+
+def check_versions(fleet: Fleet, head: int) -> None:
+    """One line of versions; what was acknowledged is in it under the number that was told, and only once."""
+    versions = []
+    cursor = head + 1
+    while cursor > 0:
+        page = fleet.world.get(f"environments/{ENVIRONMENT}/versions?limit=100" + _after(versions))
+        versions += page
+        cursor = page[-1]["version"]
+    assert [v["version"] for v in versions] == list(range(head, -1, -1)), "a gap, a fork or a number used twice"
+    assert [v["parent"] for v in versions] == [*range(head - 1, -1, -1), None]
+    told = {v["version"]: v["message"] for v in versions}
+    for writer in (*fleet.first, *fleet.writers):
+        assert writer.made
+        for message, number in writer.made.items():
+            assert told[number] == message
+    counts = Counter(told.values())
+    assert all(counts[message] == 1 for writer in fleet.writers for message in writer.made), "a commit was made twice"
+
+
+def _after(versions: list[dict[str, object]]) -> str:
+    return f"&cursor={versions[-1]['version']}" if versions else ""
+
+
+def _events(world: World) -> list[dict[str, object]]:
+    """The whole log of the environment, as a client reads it that was never there before."""
+    out: list[dict[str, object]] = []
+    answer = world.http.get("events", params={"environment": ENVIRONMENT, "since": 0, "follow": False})
+    assert answer.status_code == 200
+    for line in answer.text.splitlines():
+        if line.startswith("data:"):
+            out.append(json.loads(line[5:]))
+    return out
+
+
+def check_robots(fleet: Fleet, head: dict[str, object]) -> None:
+    """All on the head's root, whole, and what they processed never went back and was never done twice."""
+    for robot in fleet.robots:
+        name = robot.into.name
+        assert robot.standing["root"] == head["root"]
+        robot.wait("hook", version=head["version"])
+        lines = (fleet.world.folder / f"{name}.hooks").read_text().split("\n")[:-1]
+        done = [(int(a), int(b), c) for a, b, c in (line.split() for line in lines)]
+        sequences = [sequence for sequence, _, _ in done]
+        assert sequences == sorted(set(sequences)), f"{name} processed a sequence twice, or an older one"
+        assert len(done) > 1, f"{name} followed nothing"
+        assert done[-1][2] == head["root"]
+        for kind in ("refused", "damaged"):
+            assert robot.saw(kind) is None, robot.saw(kind)
+        assert robot.process.poll() is None, f"{name} has ended: {robot.lines[-3:]}"
+    assert fleet.watcher.looks > 100
+    proof = eventually(lambda: _agreed(fleet), 60)
+    assert proof == {"latest": 2, "production": 1}
+
+
+def _agreed(fleet: Fleet) -> dict[str, int] | None:
+    """How many robots hold their channel's root, once all do by what the server says."""
+    channels = fleet.world.get(f"environments/{ENVIRONMENT}/channels")
+    if any(c["robots"]["holding"] != c["robots"]["total"] for c in channels):
+        return None
+    return {c["channel"]: c["robots"]["holding"] for c in channels}

@@ -1,0 +1,458 @@
+"""A server, its router and its database in processes of their own, robots that follow, writers that never give up."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import random
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import zenoh
+
+from app.events.bus import BusOptions, router_configuration
+from app.events.router import Router
+from app.store import Store
+from tests.agent.conftest import ROOT, Robot, network
+from tests.api.conftest import ADMIN
+from tests.cli.conftest import ServerProcess
+from tests.events.conftest import Listener, client_config, eventually, free_port
+from tests.postgres import Cluster
+
+ENVIRONMENT = "farm"
+HEADERS = {"Authorization": f"Bearer {ADMIN}"}
+SIDE = 300
+"""Cells along a side of the noisy grid: 90 kB that no delta makes small."""
+
+SHADES = bytes((0, 205, 254)[k % 3] for k in range(256))
+
+COMMIT, RELAY, DOWNLOAD, ANY = "commit", "relay", "download", "any"
+
+
+class World:
+    """All of it. own_router: the server's own one, else a separate one that the server is a client of."""
+
+    def __init__(self, folder: Path, cluster: Cluster | None, *, own_router: bool) -> None:
+        self.folder, self.cluster, self.own_router = folder, cluster, own_router
+        self.port, self.zenoh = free_port(), free_port()
+        self.variables = {
+            "FLEETMAP_ADMIN_TOKEN": ADMIN,
+            "FLEETMAP_CONVERSION_WORKERS": "1",
+            "FLEETMAP_LOG_LEVEL": "warning",
+            "FLEETMAP_ZENOH_MODE": "router" if own_router else "client",
+            "FLEETMAP_ZENOH_LISTEN": f"tcp/127.0.0.1:{self.zenoh}",
+        }
+        if not own_router:
+            where = f"tcp/127.0.0.1:{self.zenoh}"
+            self.variables |= {"FLEETMAP_ZENOH_CONNECT": where, "FLEETMAP_ZENOH_ADVERTISE": where}
+        if cluster is not None:
+            url = cluster.url(cluster.create_database())
+            self.variables["FLEETMAP_DATABASE_URL"] = url
+            (folder / "data" / "blobs").mkdir(parents=True)
+            store = Store(url, folder / "data" / "blobs")
+            store.migrate()
+            store.close()
+        self.router = None if own_router else self._separate()
+        self.printed: list[str] = []
+        self.server: ServerProcess | None = None
+        self.serve()
+        self.http = httpx.Client(base_url=f"http://127.0.0.1:{self.port}/api/v1", headers=HEADERS, timeout=20)
+
+    # --- what is killed, and comes back ---
+
+    def serve(self) -> None:
+        """Start the server; until it answers."""
+        arguments = ("--port", str(self.port), "--data-dir", str(self.folder / "data"))
+        self.server = ServerProcess(*arguments, environment=self.variables, folder=ROOT)
+        self.server.ready()
+
+    def kill_server(self) -> None:
+        assert self.server is not None
+        self.server.process.send_signal(signal.SIGKILL)
+
+    def revive_server(self) -> None:
+        assert self.server is not None
+        self.server.stop(signal.SIGKILL)
+        self.printed += self.server.lines
+        self.serve()
+
+    def kill_router(self) -> None:
+        """The server's own one, which it starts again itself, or the separate one."""
+        if self.router is not None:
+            self.router._process.kill()
+            return
+        assert self.server is not None
+        found = subprocess.run(
+            ["pgrep", "-P", str(self.server.process.pid), "-f", "app.events.router"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        for process in found.stdout.split():
+            os.kill(int(process), signal.SIGKILL)
+
+    def revive_router(self) -> None:
+        if self.router is not None:
+            self.router.close()
+            self.router = self._separate()
+
+    def _separate(self) -> Router:
+        for _ in range(50):
+            router = Router(router_configuration(BusOptions(listen=f"tcp/127.0.0.1:{self.zenoh}")))
+            if router.problem is None:
+                return router
+            time.sleep(0.1)
+        raise AssertionError(f"the router does not start again: {router.problem}")
+
+    def kill_database(self) -> None:
+        assert self.cluster is not None
+        self.cluster.kill()
+
+    def revive_database(self) -> None:
+        assert self.cluster is not None
+        self.cluster.restart()
+
+    def close(self) -> None:
+        self.http.close()
+        if self.server is not None:
+            self.server.stop()
+            self.printed += self.server.lines
+        if self.router is not None:
+            self.router.close()
+
+    # --- what is asked ---
+
+    def get(self, path: str, seconds: float = 60.0) -> Any:
+        """JSON of the server, also where it is just coming back."""
+        deadline = time.monotonic() + seconds
+        while True:
+            with contextlib.suppress(httpx.TransportError):
+                answer = self.http.get(path)
+                if answer.status_code == 200:
+                    return answer.json()
+                assert answer.status_code == 503, f"{path}: {answer.status_code} {answer.text}"
+            assert time.monotonic() < deadline, f"{path} is not answered"
+            time.sleep(0.1)
+
+
+class Writer:
+    """Commits one change after the other, each with a key and again until the server has said that it has it."""
+
+    def __init__(self, world: World, name: str, seed: int) -> None:
+        self._world, self._dice = world, random.Random(seed)
+        self.name = name
+        self.busy = threading.Event()
+        self.stopping = threading.Event()
+        self.made: dict[str, int] = {}
+        self.tries = 0
+        self.last = 0.0
+        self.problem: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        self.stopping.set()
+        self._thread.join(90)
+        assert not self._thread.is_alive(), f"{self.name} hangs"
+        if self.problem is not None:
+            raise self.problem
+
+    def _run(self) -> None:
+        try:
+            with httpx.Client(base_url=self._world.http.base_url, headers=HEADERS, timeout=20) as client:
+                count = 0
+                while not self.stopping.is_set():
+                    count += 1
+                    self._commit(client, f"{self.name} {count}")
+                    self.stopping.wait(self._dice.uniform(0, 0.3))
+        except BaseException as error:  # noqa: BLE001  the test's thread raises it
+            self.problem = error
+
+    def _commit(self, client: httpx.Client, message: str) -> None:
+        files = self._files()
+        while True:
+            self.tries += 1
+            self.busy.set()
+            try:
+                answer = client.post(
+                    f"environments/{ENVIRONMENT}/versions",
+                    files=[("files", (name, data)) for name, data in files.items()],
+                    data={"message": message},
+                    headers={"Idempotency-Key": message},
+                )
+            except httpx.TransportError:
+                time.sleep(self._dice.uniform(0, 0.2))
+                continue
+            finally:
+                self.busy.clear()
+            if answer.status_code == 201:
+                self.made[message] = answer.json()["version"]
+                self.last = time.monotonic()
+                return
+            assert answer.status_code == 503, f"{answer.status_code} {answer.text}"
+            time.sleep(self._dice.uniform(0, 0.2))
+
+    def _files(self) -> dict[str, bytes]:
+        raise NotImplementedError
+
+
+class Surveyor(Writer):
+    """Moves a node of the network."""
+
+    def _files(self) -> dict[str, bytes]:
+        return {"n.tmap2.yaml": network(round(self._dice.uniform(0.001, 5), 6), 100)}
+
+
+class Mapper(Writer):
+    """Maps the place again: another noisy grid."""
+
+    def _files(self) -> dict[str, bytes]:
+        pixels = self._dice.randbytes(SIDE * SIDE).translate(SHADES)
+        described = b"image: map.pgm\nresolution: 0.1\norigin: [0.0, 0.0, 0.0]\nnegate: 0\n"
+        described += b"occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+        return {"map.yaml": described, "map.pgm": b"P5 %d %d 255\n" % (SIDE, SIDE) + pixels}
+
+
+class Promoter(Writer):
+    """Moves the channel production forth, and now and then back."""
+
+    def _commit(self, client: httpx.Client, message: str) -> None:
+        del message
+        with contextlib.suppress(httpx.TransportError):
+            head = client.get(f"environments/{ENVIRONMENT}/versions/latest")
+            if head.status_code == 200:
+                back = self._dice.choice((0, 0, 0, 1, 3))
+                self.promote(client, max(2, head.json()["version"] - back))
+        self.stopping.wait(0.3)
+
+    @staticmethod
+    def promote(client: httpx.Client, version: int) -> bool:
+        answer = client.put(f"environments/{ENVIRONMENT}/channels/production", json={"version": version})
+        assert answer.status_code in (200, 503), answer.text
+        return answer.status_code == 200
+
+
+class Reader:
+    """A reader of server-sent events that resumes with ``Last-Event-ID``: ``sequences`` is what it processed."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.sequences: list[int] = []
+        self.connections = 0
+        self.stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self.stopping.is_set():
+            with contextlib.suppress(httpx.TransportError):
+                self._read()
+            self.stopping.wait(0.1)
+
+    def _read(self) -> None:
+        headers = {**HEADERS, "Last-Event-ID": str(self.sequences[-1] if self.sequences else 0)}
+        params = {"environment": ENVIRONMENT}
+        timeout = httpx.Timeout(5.0, read=20.0)
+        with (
+            httpx.Client(base_url=self._world.http.base_url, headers=headers, timeout=timeout) as client,
+            client.stream("GET", "events", params=params) as answer,
+        ):
+            if answer.status_code != 200:
+                return
+            self.connections += 1
+            for line in answer.iter_lines():
+                if line.startswith("data:"):
+                    self.sequences.append(json.loads(line[5:])["sequence"])
+                if self.stopping.is_set():
+                    return
+
+    def stop(self) -> None:
+        self.stopping.set()
+        self._thread.join(30)
+
+
+class Watcher:
+    """Looks at what stands on the robots' disks all the time: never half a map, never back."""
+
+    def __init__(self, robots: list[Robot]) -> None:
+        self._robots = robots
+        self.looks = 0
+        self.problem: BaseException | None = None
+        self.stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        marks: dict[str, int] = {}
+        try:
+            while not self.stopping.wait(0.05):
+                for robot in self._robots:
+                    sequence = look(robot.into)
+                    if sequence is not None:
+                        self.looks += 1
+                        name = robot.into.name
+                        assert sequence >= marks.get(name, 0), f"{name} went back to the sequence {sequence}"
+                        marks[name] = sequence
+        except BaseException as error:  # noqa: BLE001  the test's thread raises it
+            self.problem = error
+
+    def stop(self) -> None:
+        self.stopping.set()
+        self._thread.join(30)
+        if self.problem is not None:
+            raise self.problem
+
+
+def look(into: Path) -> int | None:
+    """The sequence of what stands, all of whose files are as its manifest says; None where nothing stands yet."""
+    for _ in range(20):
+        try:
+            version = (into / "current").resolve(strict=True)
+        except FileNotFoundError:
+            return None
+        try:
+            manifest = json.loads((version / "manifest.json").read_bytes())
+            for file in manifest["files"]:
+                data = (version / file["format"] / file["name"]).read_bytes()
+                told = (file["size"], file["sha256"])
+                assert (len(data), hashlib.sha256(data).hexdigest()) == told, f"{into.name}: half a map: {file}"
+            return int(manifest["sequence"])
+        except FileNotFoundError:
+            # Three switches have come since: the old version was tidied away. What stands now must be whole.
+            assert (into / "current").resolve() != version, f"{into.name}: a file is missing in what stands"
+    raise AssertionError(f"{into.name} switches faster than anybody can look")
+
+
+class Fleet:
+    """Robots, the two readers of events, and the writers of one world."""
+
+    def __init__(self, world: World, seed: int) -> None:
+        self.world = world
+        self.dice = random.Random(seed)
+        world.http.post("environments", json={"name": ENVIRONMENT}).raise_for_status()
+        self.writers: list[Writer] = [Surveyor(world, "surveyor", seed + 1), Mapper(world, "mapper", seed + 2)]
+        self.first = [Mapper(world, "first map", seed + 3), Surveyor(world, "first network", seed + 4)]
+        for writer in self.first:
+            writer._commit(world.http, writer.name)
+        assert Promoter.promote(world.http, 2)
+        self.promoter = Promoter(world, "promoter", seed + 5)
+        self.robots: list[Robot] = []
+        server = f"http://127.0.0.1:{world.port}"
+        for name, *more in (
+            ("hearing", "--poll", "3600", "--channel", "latest"),  # nothing but events, and the router's return
+            ("polling", "--poll", "1", "--channel", "latest"),
+            ("promoted", "--poll", "3600", "--channel", "production"),
+        ):
+            hook = f'echo "$FLEETMAP_SEQUENCE $FLEETMAP_VERSION $FLEETMAP_ROOT" >> {world.folder}/{name}.hooks'
+            variables = {"FLEETMAP_ZENOH_CONNECT": "tcp/127.0.0.1:1"} if name == "polling" else {}
+            self.robots.append(
+                Robot(
+                    server,
+                    ENVIRONMENT,
+                    world.folder / name,
+                    *more,
+                    "--on-change",
+                    hook,
+                    formats="tmap2,occupancy_grid",
+                    **variables,
+                )
+            )
+        for robot in self.robots:
+            robot.wait("active")
+        self.session = zenoh.open(client_config(world.zenoh))
+        self.listener = Listener(self.session, f"fleetmap/{ENVIRONMENT}/events")
+        self.reader = Reader(world)
+        self.watcher = Watcher(self.robots)
+        for writer in (*self.writers, self.promoter):
+            writer.start()
+
+    def made(self) -> int:
+        """How many commits were acknowledged."""
+        return sum(len(writer.made) for writer in self.writers)
+
+    def wait_for(self, phase: str) -> None:
+        """Until a moment in the middle of a phase."""
+        if phase == COMMIT:
+            self._until(lambda: any(writer.busy.is_set() for writer in self.writers))
+            time.sleep(self.dice.uniform(0, 0.08))
+        elif phase == RELAY:
+            count = self.made()
+            self._until(lambda: self.made() > count)
+            time.sleep(self.dice.uniform(0, 0.01))
+        elif phase == DOWNLOAD:
+            lines = [len(robot.lines) for robot in self.robots]
+            self._until(lambda: any(self._fetching(r, n) for r, n in zip(self.robots, lines, strict=True)))
+            time.sleep(self.dice.uniform(0, 0.05))
+        else:
+            time.sleep(self.dice.uniform(0, 0.5))
+
+    def under_way(self) -> set[str]:
+        """The phases that something is in at this moment."""
+        found = set()
+        if any(writer.busy.is_set() for writer in self.writers):
+            found.add(COMMIT)
+        heard = {event["version"] for event in list(self.listener.events)}
+        if any(version not in heard for writer in self.writers for version in list(writer.made.values())[-3:]):
+            found.add(RELAY)
+        if any(self._fetching(robot) for robot in self.robots):
+            found.add(DOWNLOAD)
+        return found
+
+    @staticmethod
+    def _fetching(robot: Robot, after: int = 0) -> bool:
+        kinds = [line["event"] for line in list(robot.lines)[after:]]
+        last = next((kind for kind in reversed(kinds) if kind in ("downloading", "switched", "failed")), None)
+        return last == "downloading"
+
+    @staticmethod
+    def _until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition() and time.monotonic() < deadline:
+            time.sleep(0.001)
+
+    def settle(self, seconds: float = 90.0) -> dict[str, Any]:
+        """End the writers, promote the head, and wait until everybody has all of it: the head."""
+        for writer in (*self.writers, self.promoter):
+            writer.stop()
+        head: dict[str, Any] = self.world.get(f"environments/{ENVIRONMENT}/versions/latest")
+        eventually(lambda: Promoter.promote(self.world.http, head["version"]), seconds)
+        for robot in self.robots:
+            try:
+                eventually(lambda r=robot: r.standing["root"] == head["root"], seconds)
+            except AssertionError:
+                told = "\n".join(map(str, robot.lines[-20:]))
+                raise AssertionError(f"{robot.into.name} does not come to {head['version']}:\n{told}") from None
+        return head
+
+    def close(self) -> None:
+        for writer in (*self.writers, self.promoter):
+            writer.stopping.set()
+        self.watcher.stopping.set()
+        self.reader.stop()
+        for robot in self.robots:
+            robot.kill()
+        self.session.close()  # type: ignore[no-untyped-call]
+
+
+@contextlib.contextmanager
+def fleet_of(folder: Path, cluster: Cluster | None, *, own_router: bool, seed: int) -> Iterator[Fleet]:
+    """A world with a fleet in it, at work."""
+    world = World(folder, cluster, own_router=own_router)
+    try:
+        fleet = Fleet(world, seed)
+        try:
+            yield fleet
+        finally:
+            fleet.close()
+    finally:
+        world.close()
