@@ -100,3 +100,17 @@ def test_damaged_tiles_are_422_with_the_reason(api: Api, fresh: Callable[[], str
     assert refused["errors"][0]["file"] == "a.tif"
     assert "vsimem" not in str(refused)
     assert api.get(f"environments/{env}").json()["version"] == 0
+
+
+def test_a_grid_is_served_as_a_picture(api: Api) -> None:
+    said = b"image: map.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    cells = bytes(254 if k % 7 else 0 for k in range(200))
+    api.post("environments", {"name": "drawn-plan"})
+    api.upload("drawn-plan", {"map.yaml": said, "map.pgm": b"P5\n20 10\n255\n" + cells})
+    rows = {row["format"]: row for row in api.get("environments/drawn-plan/versions/latest/maps").json()}
+    assert [step["step"] for step in rows["satellite"]["chain"]] == ["occupancy_to_imagery"]
+    assert api.get("/maps/drawn-plan/satellite/satellite.png").content[:4] == b"\x89PNG"
+    report = api.get("environments/drawn-plan/versions/latest/reports/satellite?pixel=0.2").json()
+    assert report["layers"][0]["information"] == "derived"
+    assert report["layers"][0]["steps"][0]["parameters"]["pixel"] == 0.2
+    assert any("no photograph" in w["problem"] for w in report["warnings"])

@@ -109,7 +109,7 @@ def test_convert(api: Api) -> None:
     [
         ({}, 422),
         ({"to": "nosuch"}, 422),
-        ({"to": "satellite"}, 422),
+        ({"to": "satellite", "pixel": "-1"}, 422),
         ({"to": "tmap2", "format": "nosuch"}, 422),
         ({"to": "tmap2", "colour": "red"}, 422),
         ({"to": "tmap2", "datum": "x"}, 422),

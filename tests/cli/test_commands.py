@@ -172,7 +172,7 @@ def test_coverage_and_formats(fleetmap: Fleetmap, network: Path) -> None:
     rows = {row["format"]: row["state"] for row in fleetmap("coverage", "covered", "--json").json}
     assert rows["tmap2"] == "direct"
     assert rows["occupancy_grid"] == "derivable"
-    assert rows["satellite"] == "missing"
+    assert rows["datum"] == "missing"
     told = fleetmap("coverage", "covered").out
     assert "tmap2" in told
     known = {f["id"]: f for f in fleetmap("formats", "--json").json}
