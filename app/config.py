@@ -160,8 +160,11 @@ class Settings(BaseSettings):
 
     models_dir: Path | None = Field(
         default=None,
-        description="Folder of segmentation models for pictures: `NAME.onnx`, with its classes in `NAME.json`. Unset: "
-        "none.",
+        description="Folder of segmentation models for pictures: `NAME.onnx`, with its classes in `NAME.json`; of the "
+        "Segment-Anything family `NAME.encoder.onnx` and `NAME.decoder.onnx`. Unset: none.",
+    )
+    models_max_bytes: int = Field(
+        default=2 * 2**30, ge=1, description="Largest model: the sum of its files. It must fit into a process' memory."
     )
     imagery_url: str | None = Field(
         default=None,

@@ -221,6 +221,7 @@ def open_services(settings: Settings) -> Services:
             intake = Intake(settings.spool_dir, settings.limits, at_once=settings.max_uploads)
         if settings.models_dir is not None:
             os.environ["FLEETMAP_MODELS_DIR"] = str(settings.models_dir.resolve())  # where derivations look for it
+            os.environ["FLEETMAP_MODELS_MAX_BYTES"] = str(settings.models_max_bytes)
         pool = Pool(
             settings.conversion_workers,
             memory_bytes=settings.max_memory_bytes,

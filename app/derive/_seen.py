@@ -42,8 +42,7 @@ def seen(on: Ground, picture: Picture, how: Segmentation, method: str, notes: No
     if method == "model":
         if not how.model:
             raise Invalid("model: name one", [Problem("segmentation=model needs the name of a model", where="model")])
-        least = 1.0 if how.minimum_area is None else how.minimum_area
-        return _model.segments(on, _model.load(how.model), how.confidence, least, notes, name)
+        return _model.segments(on, how, notes, name)
     nir = infrared(picture, how.near_infrared, name) if method == "index" else None
     return segments(on, how, method, nir, notes, name)
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,10 @@ from app.derive._pictures import Ground
 from app.errors import CannotConvert
 from app.parameters import parameter
 
-Kind = Literal["field", "tree", "vegetation", "path", "road", "building"]
+Kind = Literal["field", "tree", "vegetation", "path", "road", "building", "area"]
+KINDS: tuple[str, ...] = get_args(Kind)
+"""What is told; an ``area`` is a thing of its own of which it is not known what it is."""
+
 Mask = NDArray[np.uint8]
 
 GREEN = 0.06
@@ -61,6 +64,9 @@ FIELD, TURF = 50.0, 10.0
 BUILDING, SIDE, RECTANGULAR = 8.0, 2.5, 0.78
 """Least square metres, least metres of a side, and least share of its rectangle, of a building."""
 
+MIXED = 0.25
+"""Share of green up to which an area does not grow, and of what is not green up to which it does."""
+
 SAMPLE = 2**16
 """Pixels by which the groups are found."""
 
@@ -83,8 +89,27 @@ class Segmentation:
         maximum=100.0,
         unit="m",
     )
-    model: str | None = parameter(None, "model: name of the operator's model, of the YOLO family, in ONNX")
-    confidence: float = parameter(0.25, "model: what it is less sure of is left out", minimum=0.01, maximum=1.0)
+    model: str | None = parameter(
+        None,
+        "model: name of the operator's model in ONNX: of the YOLO or Segment-Anything family, or one that tells pixels",
+    )
+    confidence: float | None = parameter(
+        None,
+        "model: what it is less sure of is left out; default: 0.25, of Segment-Anything (its predicted IoU) 0.88, of "
+        "one that tells pixels 0.5",
+        minimum=0.01,
+        maximum=1.0,
+    )
+    points: int | None = parameter(
+        None, "model, Segment-Anything: it is asked at so many points along a tile; default: 16", minimum=1, maximum=64
+    )
+    stability: float | None = parameter(
+        None,
+        "model, Segment-Anything: least intersection over union of a mask with itself at another threshold; default: "
+        "0.95",
+        minimum=0.0,
+        maximum=1.0,
+    )
     clusters: int = parameter(8, "colour: how many groups of like colour", minimum=2, maximum=32)
     cluster_seed: int = parameter(0, "colour: another number starts with other groups", minimum=0, maximum=2**31 - 1)
     near_infrared: int | None = parameter(
@@ -102,6 +127,8 @@ class Segmentation:
 OWN = {
     "model": ("model",),
     "confidence": ("model",),
+    "points": ("model",),
+    "stability": ("model",),
     "clusters": ("colour",),
     "cluster_seed": ("colour",),
     "near_infrared": ("index",),
@@ -351,40 +378,109 @@ class _Work:
             self._by_shape(piece, at, area)
 
     def _by_shape(self, piece: NDArray[np.bool_], at: tuple[slice, slice], area: int) -> None:
+        ends = at[0].start == 0 or at[1].start == 0 or at[0].stop == self.height or at[1].stop == self.width
+        region = _shaped(piece, self.lightness[at], area, self.least, self.size, ends)
+        if region is not None:
+            self.add(piece, at, region)
+
+
+class Colours:
+    """Tells the kinds of areas that somebody else has found, by the same colours and shapes."""
+
+    def __init__(self, ground: Ground, least: float) -> None:
+        """least: square metres of the smallest thing."""
         import cv2
 
-        # Without dents and holes of a pixel or two, which would make every outline long.
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
-        plain = cv2.morphologyEx(np.pad(piece, 4).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
-        outlines, order = cv2.findContours(plain, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-        large = [c for c, o in zip(outlines, order[0], strict=True) if o[3] < 0 or cv2.contourArea(c) >= self.least]
-        around = sum(cv2.arcLength(cv2.approxPolyDP(c, 2.0, True), True) for c in large) + 4 * len(large)
-        outer = max(outlines, key=cv2.contourArea)
-        (_, _), (w, h), _ = cv2.minAreaRect(outer)
-        w, h = w + 1, h + 1
-        filled = cv2.contourArea(outer) + cv2.arcLength(outer, True) / 2 + 1
-        rectangular = min(1.0, filled / (w * h))
-        # Length and width of the band with this area and this way around it.
-        length = (around + math.sqrt(max(around * around - 16 * area, 0.0))) / 4
-        width = area / length
-        shade = float(self.lightness[at][piece].std())
-        uniform = max(0.0, 1.0 - shade / 25.0)
-        said: dict[str, Any] = {"area": self.metres(area)}
-        metres, side = width * self.size, min(w, h) * self.size
-        long = length >= LONG * width and metres <= ROAD and length * self.size >= 2 * WINDOW
-        ends = at[0].start == 0 or at[1].start == 0 or at[0].stop == self.height
-        ends = ends or at[1].stop == self.width
-        straight = rectangular >= RECTANGULAR and self.metres(area) >= BUILDING and side >= SIDE
-        # A way leads somewhere: a straight band that lies alone in the picture is rather a roof.
-        if straight and (max(w, h) < LONG * min(w, h) or (not ends and max(w, h) < 3 * LONG * min(w, h))):
-            sides = sorted((round(w * self.size, 2), round(h * self.size, 2)), reverse=True)
-            self.add(piece, at, Region("building", _fit(rectangular * uniform), {**said, "sides": sides}))
-        elif long:
-            slender = 1.0 - LONG / 2 / max(length / width, LONG)
-            kind: Kind = "path" if metres <= PATH else "road"
-            self.add(piece, at, Region(kind, _fit(slender * uniform), {**said, "width": round(metres, 2)}))
-        elif self.metres(area) >= FIELD:
-            self.add(piece, at, Region("field", _fit(0.6 * uniform), {**said, "surface": "bare"}))
+        self.size, self.grey = ground.resolution, ground.grey
+        self.least = max(least / self.size**2, 1.0)
+        self.shape = ground.known.shape
+        smooth = cv2.bilateralFilter(ground.rgb, 5, 25.0, 2.0).astype(np.float32)
+        self.green = (2 * smooth[..., 1] - smooth[..., 0] - smooth[..., 2]) > GREEN * np.maximum(
+            smooth.sum(axis=2), 1.0
+        )
+        self.light = cv2.cvtColor(ground.rgb.astype(np.float32) / 255.0, cv2.COLOR_RGB2LAB)[..., 0]
+        self.box = max(3, int(WINDOW / self.size) // 2 * 2 + 1)
+        self.rough = cv2.blur(np.abs(self.light - cv2.medianBlur(self.light, 5)), (self.box, self.box)) > ROUGH
+
+    def kind(self, mask: NDArray[np.bool_], at: tuple[slice, slice]) -> Region:
+        """What a mask within a window of the picture is; an ``area`` where colour and shape do not say."""
+        import cv2
+
+        size = int(mask.sum())
+        area = round(size * self.size**2, 2)
+        unsure = Region("area", 1.0, {"area": area})
+        if self.grey:
+            return unsure
+        grows = float(self.green[at][mask].mean())
+        light = float(self.light[at][mask].mean())
+        if MIXED < grows < 1 - MIXED:
+            return unsure
+        if grows <= MIXED:
+            ends = any(s.start == 0 or s.stop == n for s, n in zip(at, self.shape, strict=True))
+            return (
+                None if light < SHADOW else _shaped(mask, self.light[at], size, self.least, self.size, ends)
+            ) or unsure
+        inner = cv2.erode(np.pad(mask, 1).astype(np.uint8), np.ones((self.box, self.box), np.uint8))[1:-1, 1:-1] == 1
+        if light >= DARK and not (inner.any() and self.rough[at][inner].mean() > 0.5):
+            return Region("field", _fit(grows), {"surface": "green", "area": area}) if area >= TURF else unsure
+        round_ = _roundness(mask)
+        across = 2 * math.sqrt(size / math.pi) * self.size
+        if round_ >= ROUND and CROWNS[0] <= across <= CROWNS[1]:
+            return Region("tree", _fit(round_ * grows), {"area": area, "width": round(across, 2)})
+        return Region("vegetation", _fit(0.6 * grows), {"area": area})
+
+
+def way(kind: str, mask: NDArray[np.bool_], size: float) -> dict[str, Any]:
+    """What a path or road of this shape says more than other kinds: its mean width. size: metres a pixel."""
+    if kind not in ("path", "road"):
+        return {}
+    _, width, _ = _band(mask, int(mask.sum()), 1.0)
+    return {"width": round(width * size, 2)}
+
+
+def _band(piece: NDArray[np.bool_], area: int, least: float) -> tuple[float, float, Any]:
+    """(length, width, outline) in pixels of the band with this area and this way around it."""
+    import cv2
+
+    # Without dents and holes of a pixel or two, which would make every outline long.
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    plain = cv2.morphologyEx(np.pad(piece, 4).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    outlines, order = cv2.findContours(plain, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    large = [c for c, o in zip(outlines, order[0], strict=True) if o[3] < 0 or cv2.contourArea(c) >= least]
+    around = sum(cv2.arcLength(cv2.approxPolyDP(c, 2.0, True), True) for c in large) + 4 * len(large)
+    length = (around + math.sqrt(max(around * around - 16 * area, 0.0))) / 4
+    return length, area / length, max(outlines, key=cv2.contourArea)
+
+
+def _shaped(
+    piece: NDArray[np.bool_], light: NDArray[Any], area: int, least: float, size: float, ends: bool
+) -> Region | None:
+    """What a piece of ground or roof is by its shape. light: lightness of its window; area and least: pixels; size:
+    metres a pixel; ends: whether it reaches the picture's edge."""
+    import cv2
+
+    length, width, outer = _band(piece, area, least)
+    (_, _), (w, h), _ = cv2.minAreaRect(outer)
+    w, h = w + 1, h + 1
+    filled = cv2.contourArea(outer) + cv2.arcLength(outer, True) / 2 + 1
+    rectangular = min(1.0, filled / (w * h))
+    uniform = max(0.0, 1.0 - float(light[piece].std()) / 25.0)
+    square_metres = round(area * size**2, 2)
+    said: dict[str, Any] = {"area": square_metres}
+    metres, side = width * size, min(w, h) * size
+    long = length >= LONG * width and metres <= ROAD and length * size >= 2 * WINDOW
+    straight = rectangular >= RECTANGULAR and square_metres >= BUILDING and side >= SIDE
+    # A way leads somewhere: a straight band that lies alone in the picture is rather a roof.
+    if straight and (max(w, h) < LONG * min(w, h) or (not ends and max(w, h) < 3 * LONG * min(w, h))):
+        sides = sorted((round(w * size, 2), round(h * size, 2)), reverse=True)
+        return Region("building", _fit(rectangular * uniform), {**said, "sides": sides})
+    if long:
+        slender = 1.0 - LONG / 2 / max(length / width, LONG)
+        kind: Kind = "path" if metres <= PATH else "road"
+        return Region(kind, _fit(slender * uniform), {**said, "width": round(metres, 2)})
+    if square_metres >= FIELD:
+        return Region("field", _fit(0.6 * uniform), {**said, "surface": "bare"})
+    return None
 
 
 def _inner(at: tuple[slice, slice], inner: tuple[slice, slice]) -> tuple[slice, slice]:

@@ -27,9 +27,9 @@ class Parameters(Segmentation):
 def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """A picture as an occupancy grid: trees, vegetation, buildings and walls are occupied.
 
-    Fields, paths, roads and a plan's rooms are free, everything else is unknown. The origin is a whole multiple of the
-    resolution, yaw 0. Raises CannotConvert where the picture shows nothing that can be told, MissingDatum where it lies
-    on earth and there is no datum.
+    Fields, paths, roads and a plan's rooms are free, everything else (also a model's ``area``) is unknown. The origin
+    is a whole multiple of the resolution, yaw 0. Raises CannotConvert where the picture shows nothing that can be told,
+    MissingDatum where it lies on earth and there is no datum.
     """
     parts: dict[PartKey, Part] = {}
     for key, picture in chosen(layers, parameters.picture).items():
@@ -44,7 +44,7 @@ def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
             found = seen(on, picture, parameters, method, notes, name)
             cells = np.full(found.label.shape, UNKNOWN, np.uint8)
             cells[found.open_] = FREE
-            values = np.array([UNKNOWN, *(OCCUPIED if r.kind in OBSTACLES else FREE for r in found.regions)], np.uint8)
+            values = np.array([UNKNOWN, *(_value(r.kind) for r in found.regions)], np.uint8)
             there = found.label > 0
             cells[there] = values[found.label[there]]
             bottom = on.top - on.resolution * len(cells)
@@ -55,3 +55,8 @@ def imagery_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
         notes.warn("the grid is guessed from a picture: look at it before a robot drives by it", where=key.name)
         parts[PartKey("occupancy", key.level, MAP)] = grid
     return Layers(parts, layers.datum, layers.levels)
+
+
+def _value(kind: str) -> int:
+    """The cells of a region."""
+    return OCCUPIED if kind in OBSTACLES else UNKNOWN if kind == "area" else FREE

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import shapely
 
-from app.derive import Notes, _model
+from app.derive import Notes, _onnx
 from app.derive.imagery_to_objects import Parameters, imagery_to_objects
 from app.derive.imagery_to_occupancy import Parameters as GridParameters
 from app.derive.imagery_to_occupancy import imagery_to_occupancy
@@ -71,7 +71,7 @@ def model(rows: Any, prototypes: Any = None, *, side: int | None = SIDE, names: 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(_model.FOLDER, str(tmp_path))
+    monkeypatch.setenv(_onnx.FOLDER, str(tmp_path))
     return tmp_path
 
 
@@ -185,7 +185,7 @@ def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
         found(content(), confidence=0.95)
     for name in ("../tiny", "other", "tiny.onnx"):
         with pytest.raises(NotFound, match="there are: tiny"):
-            _model.load(name)
+            _onnx.supplied(name)
     with pytest.raises(Invalid, match="name one"):
         imagery_to_objects(content(), Parameters(segmentation="model"), Notes())
     with pytest.raises(Invalid, match="belongs to segmentation=model"):
@@ -197,10 +197,10 @@ def test_what_cannot_be_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
             raise ModuleNotFoundError(name)
         return real(name, *more)
 
-    monkeypatch.setattr(_model.importlib, "import_module", absent)
+    monkeypatch.setattr(_onnx.importlib, "import_module", absent)
     with pytest.raises(CannotConvert, match=r'pip install "fleet-map-server\[models\]"'):
         found(content())
-    monkeypatch.delenv(_model.FOLDER)
+    monkeypatch.delenv(_onnx.FOLDER)
     with pytest.raises(CannotConvert, match="FLEETMAP_MODELS_DIR"):
         found(content())
 

@@ -1,0 +1,189 @@
+"""Models in ONNX that the operator supplies: which there are, loading them, and asking them.
+
+They lie in the folder ``FLEETMAP_MODELS_DIR``: ``NAME.onnx``, or of the Segment-Anything family two files,
+``NAME.encoder.onnx`` and ``NAME.decoder.onnx`` (``_`` or ``-`` instead of the point, too), beside them ``NAME.json``
+where the model has classes. Together they are at most ``FLEETMAP_MODELS_MAX_BYTES`` large, weights kept in files of
+their own included.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import json
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive._segments import KINDS
+from app.errors import CannotConvert, NotFound, TooLarge
+
+FOLDER, LARGEST = "FLEETMAP_MODELS_DIR", "FLEETMAP_MODELS_MAX_BYTES"
+MOST_BYTES = 2 * 2**30
+INSTALL = 'models need onnxruntime, which is not installed: pip install "fleet-map-server[models]"'
+
+OVERLAP = 0.2
+"""Share of a tile that the next one shows, too."""
+
+_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,99}")
+_PAIR = re.compile(r"(.+)[._-](encoder|decoder)", re.IGNORECASE)
+_TYPES: Mapping[str, type[np.generic]] = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+    "tensor(uint8)": np.uint8,
+    "tensor(int32)": np.int32,
+    "tensor(int64)": np.int64,
+    "tensor(bool)": np.bool_,
+}
+
+Array = NDArray[np.float32]
+Shape = list[int | str | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Supplied:
+    """A model of the operator's. files: the model, or its encoder and its decoder."""
+
+    name: str
+    files: tuple[Path, ...]
+
+    @property
+    def words(self) -> Path:
+        """The file with its classes."""
+        return self.files[0].with_name(f"{self.name}.json")
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """One loaded file. inputs and outputs: (type, shape) by name, in the file's order; free sizes are texts or None."""
+
+    session: Any
+    name: str
+    inputs: Mapping[str, tuple[str, Shape]]
+    outputs: Mapping[str, tuple[str, Shape]]
+
+    def run(self, feed: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
+        """What it answers, by name, as float32. The values are given the types that it wants. CannotConvert where it
+        fails, or answers with something else than numbers."""
+        given = {n: np.ascontiguousarray(v, _TYPES.get(self.inputs[n][0], np.float32)) for n, v in feed.items()}
+        try:
+            answer = self.session.run(list(self.outputs), given)
+            return {n: np.asarray(a, np.float32) for n, a in zip(self.outputs, answer, strict=True)}
+        except Exception as error:
+            raise CannotConvert(f"the model {self.name} fails: {str(error)[:300]}") from error
+
+    def signature(self) -> str:
+        """Its inputs and outputs, for people."""
+
+        def said(of: Mapping[str, tuple[str, Shape]]) -> str:
+            return ", ".join(f"{n[:60]} [{', '.join(str(s)[:20] for s in shape)}]" for n, (_, shape) in of.items())
+
+        return f"({said(self.inputs)}) → ({said(self.outputs)})"[:600]
+
+
+def supplied(name: str) -> Supplied:
+    """The operator's model of that name. CannotConvert or NotFound say what to supply, TooLarge what is too much."""
+    folder = os.environ.get(FOLDER, "")
+    if not folder:
+        raise CannotConvert(
+            f"there are no models: the operator sets {FOLDER} to a folder with {name[:100]}.onnx, or "
+            f"{name[:100]}.encoder.onnx and {name[:100]}.decoder.onnx"
+        )
+    known = _known(Path(folder))
+    if not _NAME.fullmatch(name) or name not in known:
+        raise NotFound(f"there is no model {name[:100]!r}; there are: {', '.join(known) or 'none'}")
+    files = known[name]
+    most = int(os.environ.get(LARGEST) or MOST_BYTES)
+    stems = {file.stem for file in files}
+    beside = (f for f in Path(folder).iterdir() if f.is_file() and any(f.name.startswith(stem) for stem in stems))
+    if sum(f.stat().st_size for f in beside) > most:
+        raise TooLarge(f"the files of the model {name} are larger than {most} bytes: the operator may set {LARGEST}")
+    return Supplied(name, files)
+
+
+def _known(folder: Path) -> dict[str, tuple[Path, ...]]:
+    """The models of a folder by name, sorted."""
+    files = {f.stem: f for f in sorted(folder.glob("*.onnx"))}
+    halves: dict[str, dict[str, Path]] = {}
+    for stem, file in files.items():
+        if half := _PAIR.fullmatch(stem):
+            halves.setdefault(half[1], {}).setdefault(half[2].lower(), file)
+    pairs = {n: (h["encoder"], h["decoder"]) for n, h in halves.items() if len(h) == 2}
+    taken = {f for pair in pairs.values() for f in pair}
+    return dict(sorted({**{stem: (f,) for stem, f in files.items() if f not in taken}, **pairs}.items()))
+
+
+def loaded(file: Path, name: str) -> Loaded:
+    """A file's session on one thread, so that sums are made in one order: the same picture, the same map."""
+    try:
+        runtime = importlib.import_module("onnxruntime")
+    except ModuleNotFoundError:
+        raise CannotConvert(INSTALL) from None
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    try:
+        session = runtime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise CannotConvert(f"the model {name} cannot be loaded: {file.name}: {str(error)[:300]}") from error
+    inputs, outputs = (
+        {v.name: (v.type, list(v.shape)) for v in values} for values in (session.get_inputs(), session.get_outputs())
+    )
+    return Loaded(session, name, inputs, outputs)
+
+
+def classes(model: Supplied, session: Any) -> tuple[tuple[str | None, ...], Mapping[str, Any]]:
+    """(the kind that each class becomes, or None; what else its file says).
+
+    The file is a list of kinds, or a mapping with the list as ``classes``; without a file the names in the model's own
+    metadata (as Ultralytics writes them) count.
+    """
+    file, name = model.words, model.name
+    said: Any
+    more: Mapping[str, Any] = {}
+    try:
+        if file.is_file():
+            said = json.loads(file.read_text("utf-8"))
+            if isinstance(said, dict) and "classes" in said:
+                more = {key: value for key, value in said.items() if key != "classes"}
+                said = said["classes"]
+        else:
+            said = ast.literal_eval(session.get_modelmeta().custom_metadata_map.get("names", "None"))
+        if isinstance(said, dict):
+            said = [said[key] for key in sorted(said, key=int)]
+    except (OSError, ValueError, SyntaxError, TypeError) as error:
+        raise CannotConvert(f"the classes of the model {name} cannot be read: {error}") from error
+    if not isinstance(said, list) or not said:
+        raise CannotConvert(f"the model {name} does not say its classes: put {name}.json beside it, a list of kinds")
+    if file.is_file() and not all(kind is None or kind in KINDS for kind in said):
+        raise CannotConvert(f"{file.name}: each class must be null or one of {', '.join(KINDS)}")
+    kinds = tuple(kind if kind in KINDS else None for kind in said)
+    if not any(kinds):
+        raise CannotConvert(f"no class of the model {name} is one of {', '.join(KINDS)}: put {name}.json beside it")
+    return kinds, more
+
+
+def square(shape: Iterable[int | str | None], name: str, usual: int) -> int:
+    """The side of the pictures that a model takes, of its height and width. usual: where it takes any."""
+    sizes = [n for n in shape if isinstance(n, int)]
+    if len(set(sizes)) > 1 or any(n < 32 or n > 4096 for n in sizes):
+        raise CannotConvert(
+            f"the model {name} takes pictures of {' × '.join(str(n) for n in shape)}: square ones of 32 to 4096 pixels "
+            "are needed"
+        )
+    return sizes[0] if sizes else usual
+
+
+def starts(length: int, side: int) -> list[int]:
+    """Where tiles begin along an edge, the last one at its end."""
+    if length <= side:
+        return [0]
+    step = max(1, int(side * (1 - OVERLAP)))
+    return sorted({*range(0, length - side, step), length - side})

@@ -1,0 +1,145 @@
+"""Models that tell each pixel: semantic segmentation.
+
+A tile of the picture goes in as float32 [1, 3, side, side], RGB from 0 to 1, less ``mean`` and over ``std`` (three
+numbers each in the model's ``NAME.json``; else ImageNet's, as torchvision has them). Out come logits [1, classes, h,
+w], as fine as the picture or coarser. Of a class's pixels each connected piece is a thing.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.derive._onnx import Array, Loaded, Supplied, classes, square, starts
+from app.derive._pictures import Ground
+from app.derive._segments import Region, Segments, way
+from app.errors import CannotConvert
+
+SIDE = 512
+"""Pixels of a tile where a model takes any size."""
+
+SURE = 0.5
+"""Probability from which on a pixel is told, unless asked otherwise."""
+
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+MOST = 100_000
+"""Things in one picture: more is noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A loaded model. classes: the kind that each class becomes, or None. side: pixels of a tile."""
+
+    file: Loaded
+    name: str
+    classes: tuple[str | None, ...]
+    side: int
+    mean: Array
+    deviation: Array
+
+
+def model_of(supplied: Supplied, file: Loaded) -> Model:
+    """A loaded file as a model that tells pixels. CannotConvert says what it should take."""
+    (kind, shape), *more = file.inputs.values()
+    if more or kind != "tensor(float)" or len(shape) != 4 or shape[1] not in (3, "3"):
+        raise CannotConvert(
+            f"the model {supplied.name} tells no pixels: its input is not one picture [1, 3, h, w] of floats; it is "
+            f"{file.signature()}"
+        )
+    kinds, said = classes(supplied, file.session)
+    side = square(shape[2:], supplied.name, SIDE)
+    mean, deviation = (_three(said, word, usual, supplied) for word, usual in (("mean", MEAN), ("std", DEVIATION)))
+    if (deviation <= 0).any():
+        raise CannotConvert(f"{supplied.words.name}: std must be above 0")
+    return Model(file, supplied.name, kinds, side, mean, deviation)
+
+
+def _three(said: Mapping[str, Any], word: str, usual: tuple[float, ...], supplied: Supplied) -> Array:
+    try:
+        values = np.array([float(v) for v in said.get(word, usual)], np.float32)
+    except (TypeError, ValueError):
+        values = np.empty(0, np.float32)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise CannotConvert(f"{supplied.words.name}: {word} must be three numbers, of red, green and blue from 0 to 1")
+    return values
+
+
+def segments(ground: Ground, model: Model, sure: float, least: float, notes: Notes, name: str) -> Segments:
+    """What a model tells of each pixel. least: square metres."""
+    import cv2
+
+    height, width = ground.known.shape
+    told = np.zeros((height, width), np.uint8 if len(model.classes) < 255 else np.uint16)  # 0: nothing, k: class k - 1
+    chance = np.zeros((height, width), np.float16)
+    rows, columns = starts(height, model.side), starts(width, model.side)
+    for (i, row), (j, column) in itertools.product(enumerate(rows), enumerate(columns)):
+        best, score = _tile(ground.rgb[row : row + model.side, column : column + model.side], model)
+        # Where two tiles show the same, each counts up to the middle.
+        top, left = (_half(starts_, k, model.side) for starts_, k in ((rows, i), (columns, j)))
+        inner = (slice(top, None), slice(left, None))
+        at = (slice(row + top, row + best.shape[0]), slice(column + left, column + best.shape[1]))
+        told[at], chance[at] = best[inner] + 1, score[inner]
+    told[(chance < sure) | ~ground.known] = 0
+    label = np.zeros((height, width), np.int32)
+    regions: list[Region] = []
+    other = small = 0
+    for k, kind in enumerate(model.classes, 1):
+        mask = told == k
+        if kind is None:
+            other += int(mask.sum())
+            continue
+        count, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+        large = stats[:, cv2.CC_STAT_AREA] * ground.resolution**2 >= max(least, ground.resolution**2)
+        small += int(count - 1 - large[1:].sum())
+        if len(regions) + int(large[1:].sum()) > MOST:
+            raise CannotConvert(f"{name}: the model {model.name} tells more than {MOST} things: give minimum_area")
+        for piece in (np.flatnonzero(large[1:]) + 1).tolist():
+            x, y, w, h, area = (int(v) for v in stats[piece])
+            at = (slice(y, y + h), slice(x, x + w))
+            inside = pieces[at] == piece
+            said = {"area": round(area * ground.resolution**2, 2), "model": model.name}
+            said |= way(kind, inside, ground.resolution)
+            mean = round(float(chance[at][inside].mean(dtype=np.float64)), 3)
+            regions.append(Region(kind, min(mean, 1.0), said))  # type: ignore[arg-type]
+            label[at][inside] = len(regions)
+    if not regions:
+        raise CannotConvert(f"{name}: the model {model.name} finds nothing of a confidence of {sure:g}")
+    area = round(other * ground.resolution**2)
+    notes.drop("m² of ground", area, f"{name}: of classes that the model's operator gave no kind")
+    notes.drop("spots", small, f"{name}: smaller than minimum_area={least:g} m²")
+    return Segments(label, regions, np.zeros(label.shape, bool))
+
+
+def _half(starts_: list[int], k: int, side: int) -> int:
+    """Pixels at a tile's start that the tile before it tells."""
+    return (starts_[k - 1] + side - starts_[k]) // 2 if k else 0
+
+
+def _tile(part: NDArray[np.uint8], model: Model) -> tuple[NDArray[np.int64], Array]:
+    """(class, its probability) of each pixel of a tile."""
+    import cv2
+
+    side, count = model.side, len(model.classes)
+    image = np.zeros((side, side, 3), np.float32)
+    seen = (part.astype(np.float32) / np.float32(255) - model.mean) / model.deviation
+    image[: part.shape[0], : part.shape[1]] = seen
+    answers = model.file.run({next(iter(model.file.inputs)): image.transpose(2, 0, 1)[None]})
+    logits = next(iter(answers.values()))
+    if logits.ndim != 4 or logits.shape[:2] != (1, count) or 0 in logits.shape:
+        raise CannotConvert(
+            f"the model {model.name} has other than {count} classes: it gives {logits.shape}, and "
+            f"[1, {count}, h, w] was expected"
+        )
+    full = np.stack([cv2.resize(one, (side, side), interpolation=cv2.INTER_LINEAR) for one in logits[0]])
+    full = full[:, : part.shape[0], : part.shape[1]]
+    best = full.argmax(axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        score = 1.0 / np.exp(full - full.max(axis=0)).sum(axis=0)
+    return best, np.nan_to_num(score.astype(np.float32), nan=0.0)

@@ -1,0 +1,360 @@
+"""Models of the Segment-Anything family: an image encoder and a decoder of prompts, asked all over a picture.
+
+The files are those of facebookresearch/segment-anything's ``export_onnx_model.py`` (and of MobileSAM's, which has the
+same decoder), or of SAM 2 as it is commonly exported:
+
+======= ===============================================================================================================
+encoder one picture -> ``image_embeddings``. Either [1, 3, side, side], normalised by ImageNet's mean and deviation and
+        padded with 0, or [height, width, 3] with values 0 to 255, normalised and padded in the file itself. SAM 2:
+        [1, 3, side, side] -> ``image_embed`` and ``high_res_feats_…``, the picture stretched to the square
+decoder those, ``point_coords`` [n, points, 2] in pixels of the encoder's picture, ``point_labels`` [n, points] (1: in
+        the thing, -1: no point), ``mask_input`` [n, 1, side / 4, side / 4], ``has_mask_input`` [1], ``orig_im_size``
+        [2] (height, width; SAM 2 may do without) -> ``masks``, ``iou_predictions`` [n, m] and ``low_res_masks`` [n, m,
+        side / 4, side / 4], logits
+======= ===============================================================================================================
+
+Masks are made as segment_anything's automatic mask generator makes them: at a grid of points in each tile, and in the
+whole picture made smaller; those of a low predicted IoU, or that change with the threshold, or end at a tile's edge
+are left out, and of those with nearly the same box the best of the finest tile stays. ``low_res_masks`` are preferred,
+since exports are known that cut ``masks`` as the picture of their export was. What a mask shows is told by its colour
+and shape.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.derive._onnx import Array, Loaded, Supplied, loaded, square, starts
+from app.derive._pictures import Ground
+from app.derive._segments import Colours, Region, Segments
+from app.errors import CannotConvert
+
+USUAL = 1024
+"""Pixels of a tile where the files do not say."""
+
+SURE, STABLE, POINTS = 0.88, 0.95, 16
+"""Defaults: least predicted IoU and least stability of segment_anything, and points along a tile (there 32)."""
+
+OFFSET = 1.0
+"""By which the threshold is moved either way to see whether a mask is stable."""
+
+SAME = 0.7
+"""Intersection over union of boxes from which on two masks are one thing."""
+
+EDGE = 20 / 1024
+"""Share of a tile's side: a mask that comes as near to an edge goes on beyond it."""
+
+AT_ONCE = 16
+"""Prompts that are asked together where the decoder takes several."""
+
+MOST_TILES, MOST_PROMPTS = 256, 2**15
+
+MEAN = np.array([123.675, 116.28, 103.53], np.float32)
+DEVIATION = np.array([58.395, 57.12, 57.375], np.float32)
+"""ImageNet's, of values 0 to 255."""
+
+PROMPT = ("point_coords", "point_labels", "mask_input", "has_mask_input")
+EXPECTED = (
+    "an encoder with one picture [1, 3, side, side] or [height, width, 3] as its input, and a decoder with the inputs "
+    "image_embeddings, point_coords, point_labels, mask_input, has_mask_input, orig_im_size and the outputs masks, "
+    "iou_predictions, low_res_masks (segment-anything's scripts/export_onnx_model.py), or SAM 2's with image_embed and "
+    "high_res_feats_… in place of image_embeddings"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """Both files. passed: the decoder's input for each of the encoder's outputs. side: pixels of a tile. upright:
+    whether the encoder takes [height, width, 3]. stretched: whether a tile fills the square, whatever its shape.
+    together: whether the decoder takes several prompts at once."""
+
+    encoder: Loaded
+    decoder: Loaded
+    name: str
+    passed: Mapping[str, str]
+    side: int
+    upright: bool
+    stretched: bool
+    together: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Mask:
+    """One mask: its window in the picture's pixels, its pixels there (packed), its size in pixels, its predicted IoU,
+    its stability, and how large the tile was that it was seen in."""
+
+    box: tuple[int, int, int, int]
+    bits: NDArray[np.uint8]
+    size: int
+    score: float
+    stability: float
+    tile: int
+
+    def pixels(self) -> NDArray[np.bool_]:
+        """The mask within its box."""
+        x0, y0, x1, y1 = self.box
+        return np.unpackbits(self.bits, count=(y1 - y0) * (x1 - x0)).astype(bool).reshape(y1 - y0, x1 - x0)
+
+
+def model_of(supplied: Supplied) -> Model:
+    """The two files as a model. CannotConvert says which inputs and outputs are expected."""
+    name = supplied.name
+    encoder, decoder = (loaded(file, f"{name} ({file.name})") for file in supplied.files)
+
+    def wrong(file: Loaded) -> CannotConvert:
+        return CannotConvert(
+            f"the model {name} is not of the Segment-Anything family: expected are {EXPECTED}; {file.name} is "
+            f"{file.signature()}"
+        )
+
+    if len(encoder.inputs) != 1:
+        raise wrong(encoder)
+    ((_, shape),) = encoder.inputs.values()
+    upright = len(shape) == 3 and shape[2] in (3, "3")
+    if not upright and not (len(shape) == 4 and shape[1] in (3, "3")):
+        raise wrong(encoder)
+    wants = set(decoder.inputs) - {*PROMPT, "orig_im_size"}
+    if not set(PROMPT) <= set(decoder.inputs) or not wants or not _answers(decoder):
+        raise wrong(decoder)
+    if wants <= set(encoder.outputs):
+        passed = {n: n for n in sorted(wants)}
+    elif len(wants) == 1 and len(encoder.outputs) == 1:
+        passed = {next(iter(encoder.outputs)): next(iter(wants))}
+    else:
+        raise wrong(encoder)
+    low = [4 * n if isinstance(n, int) else n for n in decoder.inputs["mask_input"][1][2:]]
+    side = square(low if upright else shape[2:], name, square(low, name, USUAL))
+    together = not isinstance((decoder.inputs["point_coords"][1] or [1])[0], int)
+    return Model(encoder, decoder, name, passed, side, upright, len(wants) > 1, together)
+
+
+def _answers(decoder: Loaded) -> bool:
+    return "iou_predictions" in decoder.outputs and bool({"low_res_masks", "masks"} & set(decoder.outputs))
+
+
+def segments(
+    ground: Ground, model: Model, sure: float, stable: float, points: int, least: float, notes: Notes, name: str
+) -> Segments:
+    """What a model sees as a thing of its own, the smaller ones above the larger ones. least: square metres.
+
+    Raises CannotConvert before work starts where the model would have to be asked too often, and where it finds
+    nothing.
+    """
+    height, width = ground.known.shape
+    tiles = list(_tiles(height, width, model.side))
+    prompts = [_grid(tile, points, ground.known) for tile in tiles]
+    asked = sum(len(p) for p in prompts)
+    if len(tiles) > MOST_TILES or asked > MOST_PROMPTS:
+        raise CannotConvert(
+            f"{name}: the model {model.name} would be asked {asked} times in {len(tiles)} tiles of {model.side} "
+            f"pixels, at most {MOST_PROMPTS} in {MOST_TILES} are done: give a coarser resolution than "
+            f"{ground.resolution:g} m, or fewer points than {points}"
+        )
+    found: list[Mask] = []
+    for tile, places in zip(tiles, prompts, strict=True):
+        if len(places):
+            found += _without_twice(_seen(ground, tile, places, model, sure, stable))
+    kept = _without_twice(found)
+    if not kept:
+        raise CannotConvert(
+            f"{name}: the model {model.name} finds nothing of a confidence of {sure:g} and a stability of {stable:g}"
+        )
+    return _told(ground, kept, model, least, notes, name)
+
+
+def _tiles(height: int, width: int, side: int) -> Iterator[tuple[int, int, int, int]]:
+    """(row, column, rows, columns) of the tiles: the whole picture, and where that is larger than a tile, its parts."""
+    yield 0, 0, height, width
+    if max(height, width) > side:
+        for row, column in itertools.product(starts(height, side), starts(width, side)):
+            yield row, column, min(side, height - row), min(side, width - column)
+
+
+def _grid(tile: tuple[int, int, int, int], points: int, known: NDArray[np.bool_]) -> Array:
+    """The points (x, y) of a tile that it is asked at, in its pixels: as dense both ways, where there is a picture."""
+    row, column, rows, columns = tile
+    step = max(rows, columns) / points
+    down, across = max(1, round(rows / step)), max(1, round(columns / step))
+    y = (np.arange(down) + 0.5) * rows / down
+    x = (np.arange(across) + 0.5) * columns / across
+    at = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    there = known[row + at[:, 1].astype(np.int64), column + at[:, 0].astype(np.int64)]
+    return at[there].astype(np.float32)
+
+
+def _seen(
+    ground: Ground, tile: tuple[int, int, int, int], places: Array, model: Model, sure: float, stable: float
+) -> list[Mask]:
+    """The good masks of one tile."""
+    import cv2
+
+    row, column, rows, columns = tile
+    part = ground.rgb[row : row + rows, column : column + columns]
+    scale = model.side / max(rows, columns)
+    high, wide = (model.side, model.side) if model.stretched else (int(rows * scale + 0.5), int(columns * scale + 0.5))
+    high, wide = max(1, high), max(1, wide)
+    shrinks = high < rows or wide < columns
+    image = cv2.resize(part, (wide, high), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    feed = _encoded(image.astype(np.float32), model)
+    at = places * np.array([wide / columns, high / rows], np.float32)
+    out: list[Mask] = []
+    count = AT_ONCE if model.together else 1
+    for k in range(0, len(at), count):
+        logits, scores = _asked(at[k : k + count], feed, (rows, columns), (high, wide), model)
+        for one, score in zip(logits[scores >= sure], scores[scores >= sure].tolist(), strict=True):
+            steady = _stability(one)
+            if steady < stable:
+                continue
+            full = cv2.resize(one, (columns, rows), interpolation=cv2.INTER_LINEAR) > 0.0
+            full &= ground.known[row : row + rows, column : column + columns]
+            mask = _mask(full, tile, ground.known.shape, score, steady)
+            if mask is not None:
+                out.append(mask)
+    return out
+
+
+def _encoded(image: Array, model: Model) -> dict[str, Array]:
+    """What the encoder says of a picture [h, w, 3] of values 0 to 255, by the decoder's names."""
+    if not model.upright:
+        padded = np.zeros((model.side, model.side, 3), np.float32)
+        padded[: image.shape[0], : image.shape[1]] = (image - MEAN) / DEVIATION
+        image = padded.transpose(2, 0, 1)[None]
+    answer = model.encoder.run({next(iter(model.encoder.inputs)): image})
+    return {theirs: answer[ours] for ours, theirs in model.passed.items()}
+
+
+def _asked(
+    at: Array, feed: Mapping[str, Array], size: tuple[int, int], inner: tuple[int, int], model: Model
+) -> tuple[Array, Array]:
+    """(logits [m, h, w] of the tile alone, predicted IoU [m]) at each of the points, one mask after the other."""
+    n, low = len(at), model.side // 4
+    prompt: dict[str, NDArray[Any]] = {
+        **feed,
+        # A point that is none stands for the box that there is not (segment_anything's own example).
+        "point_coords": np.stack([at, np.zeros_like(at)], axis=1),
+        "point_labels": np.tile(np.array([1.0, -1.0], np.float32), (n, 1)),
+        "mask_input": np.zeros((n, 1, low, low), np.float32),
+        "has_mask_input": np.zeros(1, np.float32),
+    }
+    if "orig_im_size" in model.decoder.inputs:
+        prompt["orig_im_size"] = np.array(size, np.float32)
+    answer = model.decoder.run(prompt)
+    scores = answer["iou_predictions"]
+    small = answer.get("low_res_masks")
+    masks = answer["masks"] if small is None else small
+    if masks.ndim != 4 or masks.shape[0] != n or scores.shape != masks.shape[:2] or 0 in masks.shape:
+        raise CannotConvert(
+            f"the model {model.name} answers {n} points with masks {masks.shape} and iou_predictions {scores.shape}: "
+            "expected were [points, masks, height, width] and [points, masks]"
+        )
+    if masks.shape[1] == 4:  # the first is the one for several points, which a single point does not ask for
+        masks, scores = masks[:, 1:], scores[:, 1:]
+    if small is not None:
+        down, across = (max(1, int(np.ceil(n * f / model.side))) for n, f in zip(inner, masks.shape[2:], strict=True))
+        masks = masks[:, :, :down, :across]
+    scores = np.where(np.isfinite(scores), scores, np.float32(-1))
+    return masks.reshape(-1, *masks.shape[2:]), scores.reshape(-1)
+
+
+def _stability(logits: Array) -> float:
+    """Intersection over union of a mask with itself, at a higher and at a lower threshold (one holds the other)."""
+    low = int((logits > -OFFSET).sum())
+    return int((logits > OFFSET).sum()) / low if low else 0.0
+
+
+def _mask(
+    full: NDArray[np.bool_], tile: tuple[int, int, int, int], whole: tuple[int, ...], score: float, stability: float
+) -> Mask | None:
+    """A mask in its place; None where it is empty, or goes on beyond its tile."""
+    row, column, rows, columns = tile
+    down, across = np.flatnonzero(full.any(axis=1)), np.flatnonzero(full.any(axis=0))
+    if not len(down):
+        return None
+    y0, y1, x0, x1 = int(down[0]), int(down[-1]) + 1, int(across[0]), int(across[-1]) + 1
+    near = EDGE * max(rows, columns)
+    if (row > 0 and y0 < near) or (column > 0 and x0 < near):
+        return None
+    if (row + rows < whole[0] and rows - y1 < near) or (column + columns < whole[1] and columns - x1 < near):
+        return None
+    inside = full[y0:y1, x0:x1]
+    box = (column + x0, row + y0, column + x1, row + y1)
+    return Mask(box, np.packbits(inside), int(inside.sum()), float(score), stability, rows * columns)
+
+
+def _without_twice(found: list[Mask]) -> list[Mask]:
+    """Non-maximum suppression by boxes: what is seen in a finer tile goes first, then the surest."""
+    import cv2
+
+    if not found:
+        return []
+    found = sorted(found, key=lambda m: (m.tile, -m.score, -m.stability, m.box))
+    boxes = [(m.box[0], m.box[1], m.box[2] - m.box[0], m.box[3] - m.box[1]) for m in found]
+    rank = np.linspace(1.0, 0.5, len(found)).tolist()
+    kept = cv2.dnn.NMSBoxes(boxes, rank, 0.0, SAME)
+    return [found[k] for k in sorted(int(i) for i in np.asarray(kept).ravel())]
+
+
+def _told(ground: Ground, kept: list[Mask], model: Model, least: float, notes: Notes, name: str) -> Segments:
+    """The masks as regions, by their colours and shapes."""
+    label = np.zeros(ground.known.shape, np.int32)
+    pixels = max(least / ground.resolution**2, 1.0)
+    kept.sort(key=lambda m: (-m.size, m.score, m.box))
+    clean = [(mask, cleaned) for mask in kept if (cleaned := _cleaned(mask.pixels(), pixels)) is not None]
+    for k, (mask, cleaned) in enumerate(clean, 1):
+        x0, y0, x1, y1 = mask.box
+        label[y0:y1, x0:x1][cleaned & ground.known[y0:y1, x0:x1]] = k
+    seen = np.bincount(label.ravel(), minlength=len(clean) + 1)
+    colours = Colours(ground, least)
+    regions: list[Region] = []
+    numbers = np.zeros(len(clean) + 1, np.int32)
+    unsure = 0
+    for k, (mask, _) in enumerate(clean, 1):
+        if seen[k] < pixels:
+            continue
+        x0, y0, x1, y1 = mask.box
+        at = (slice(y0, y1), slice(x0, x1))
+        mine = label[at] == k
+        rest = _without_small(mine, pixels)  # what others leave of it
+        label[at][mine & ~rest] = 0
+        if not rest.any():
+            continue
+        region = colours.kind(rest, at)
+        unsure += region.kind == "area"
+        region.confidence = round(min(1.0, max(0.05, region.confidence * min(mask.score, 1.0))), 3)
+        region.said |= {"model": model.name, "stability": round(mask.stability, 3)}
+        regions.append(region)
+        numbers[k] = len(regions)
+    if not regions:
+        raise CannotConvert(f"{name}: all that the model {model.name} finds is smaller than minimum_area={least:g} m²")
+    notes.drop(
+        "masks", len(kept) - len(regions), f"{name}: smaller than minimum_area={least:g} m², or hidden by others"
+    )
+    notes.warn(
+        f"{name}: the model {model.name} finds things and does not say what they are: {len(regions) - unsure} are told "
+        f"by colour and shape, {unsure} cannot be and are of kind area"
+    )
+    return Segments(numbers[label], regions, np.zeros(label.shape, bool))
+
+
+def _cleaned(mask: NDArray[np.bool_], least: float) -> NDArray[np.bool_] | None:
+    """A mask without pieces and holes that are too small; None where nothing is left."""
+    filled = ~_without_small(np.pad(~mask, 1, constant_values=True), least)[1:-1, 1:-1]
+    inside = _without_small(filled, least)
+    return inside if inside.any() else None
+
+
+def _without_small(mask: NDArray[np.bool_], least: float) -> NDArray[np.bool_]:
+    """A mask without its connected pieces of fewer pixels."""
+    import cv2
+
+    count, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= least
+    large[0] = False
+    return mask if large[1:].all() or count == 1 else np.asarray(large[pieces])

@@ -1,0 +1,168 @@
+"""Models of the YOLO family: boxes, and masks where the model has them.
+
+A tile of the picture goes in as float32 [1, 3, side, side], RGB from 0 to 1, the last ones padded. Out come boxes [1,
+4 + classes (+ mask coefficients), n] (YOLOv8 and later) or [1, n, 5 + classes (+ coefficients)] (YOLOv5, with
+objectness), either way round, centre and size in pixels; of a segmentation model also prototypes of masks [1,
+coefficients, h, w].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.derive._onnx import Array, Loaded, Supplied, classes, square, starts
+from app.derive._pictures import Ground
+from app.derive._segments import Region, Segments, way
+from app.errors import CannotConvert
+
+SIDE = 640
+"""Pixels of a tile where a model takes any size."""
+
+SAME = 0.5
+"""Intersection over union from which on two boxes of one class are one thing."""
+
+SURE = 0.25
+"""Confidence from which on a box counts, unless asked otherwise."""
+
+PAD = 114 / 255
+MOST = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """One detection: its box (x0, y0, x1, y1) in pixels, its class, its score, and its mask within the box's pixels."""
+
+    box: tuple[float, float, float, float]
+    kind: int
+    score: float
+    mask: NDArray[np.bool_] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A loaded model. classes: the kind that each class becomes, or None. side: pixels of a tile."""
+
+    file: Loaded
+    name: str
+    classes: tuple[str | None, ...]
+    side: int
+
+
+def model_of(supplied: Supplied, file: Loaded) -> Model:
+    """A loaded file as a model of the family. CannotConvert says what it should take."""
+    (kind, shape), *more = file.inputs.values()
+    if more or kind != "tensor(float)" or len(shape) != 4 or shape[1] not in (3, "3"):
+        raise CannotConvert(
+            f"the model {supplied.name} is not of the YOLO family: its input is not one picture [1, 3, h, w] of "
+            f"floats; it is {file.signature()}"
+        )
+    side = square(shape[2:], supplied.name, SIDE)
+    return Model(file, supplied.name, classes(supplied, file.session)[0], side)
+
+
+def segments(ground: Ground, model: Model, confidence: float, least: float, notes: Notes, name: str) -> Segments:
+    """What a model finds in a picture, the surest first where things overlap. least: square metres."""
+    found: list[Found] = []
+    for column in starts(ground.rgb.shape[1], model.side):
+        for row in starts(ground.rgb.shape[0], model.side):
+            found += _tile(ground.rgb, row, column, model, confidence)
+    kept = _without_twice(found)
+    if not kept:
+        raise CannotConvert(f"{name}: the model {model.name} finds nothing of a confidence of {confidence:g}")
+    label = np.zeros(ground.known.shape, np.int32)
+    regions: list[Region] = []
+    other = small = 0
+    height, width = len(label), len(label[0])
+    for one in kept:
+        kind = model.classes[one.kind]
+        if kind is None:
+            other += 1
+            continue
+        x0, y0 = (max(0, int(v)) for v in one.box[:2])
+        x1, y1 = min(width, int(np.ceil(one.box[2]))), min(height, int(np.ceil(one.box[3])))
+        window = label[y0:y1, x0:x1]
+        mask = np.ones(window.shape, bool) if one.mask is None else one.mask[: window.shape[0], : window.shape[1]]
+        mask = mask & (window == 0) & ground.known[y0:y1, x0:x1]
+        area = int(mask.sum()) * ground.resolution**2
+        if area <= 0 or area < least:
+            small += 1
+            continue
+        said = {"area": round(area, 2), "model": model.name, **way(kind, mask, ground.resolution)}
+        regions.append(Region(kind, round(one.score, 3), said))  # type: ignore[arg-type]
+        window[mask] = len(regions)
+    notes.drop("things", other, f"{name}: of classes that the model's operator gave no kind")
+    notes.drop("spots", small, f"{name}: smaller than minimum_area={least:g} m², or hidden by surer ones")
+    return Segments(label, regions, np.zeros(label.shape, bool))
+
+
+def _tile(rgb: NDArray[np.uint8], row: int, column: int, model: Model, confidence: float) -> list[Found]:
+    """The detections in one tile, in the picture's pixels."""
+    side = model.side
+    part = rgb[row : row + side, column : column + side]
+    image = np.full((side, side, 3), PAD, np.float32)
+    image[: part.shape[0], : part.shape[1]] = part.astype(np.float32) / np.float32(255)
+    feed = {next(iter(model.file.inputs)): image.transpose(2, 0, 1)[None]}
+    answer = list(model.file.run(feed).values())
+    rows = next((a[0] for a in answer if a.ndim == 3 and a.shape[0] == 1), None)
+    masks = next((a[0] for a in answer if a.ndim == 4 and a.shape[0] == 1), None)
+    boxes, scores, kinds, weights = _decoded(rows, 0 if masks is None else len(masks), model)
+    sure = np.flatnonzero(scores >= confidence)
+    out = []
+    for k in sure[np.argsort(-scores[sure], kind="stable")][:MOST].tolist():
+        x, y, w, h = (float(v) for v in boxes[k])
+        x0, y0, x1, y1 = (min(max(v, 0.0), float(side)) for v in (x - w / 2, y - h / 2, x + w / 2, y + h / 2))
+        x1, y1 = min(x1, float(part.shape[1])), min(y1, float(part.shape[0]))
+        if x1 - x0 < 1 or y1 - y0 < 1:
+            continue
+        mask = None if masks is None else _mask(weights[k], masks, side, (x0, y0, x1, y1))
+        box = (x0 + column, y0 + row, x1 + column, y1 + row)
+        out.append(Found(box, int(kinds[k]), float(scores[k]), mask))
+    return out
+
+
+def _decoded(rows: Array | None, coefficients: int, model: Model) -> tuple[Array, Array, NDArray[np.int64], Array]:
+    """(boxes [n, 4], scores [n], classes [n], mask coefficients [n, m]) of a model's first output."""
+    count = len(model.classes)
+    plain, older = 4 + count + coefficients, 5 + count + coefficients
+    if rows is not None:
+        for table, size in ((rows.T, rows.shape[0]), (rows, rows.shape[1])):
+            if size in (plain, older):
+                first = 4 if size == plain else 5
+                chances = table[:, first : first + count]
+                if size == older:
+                    chances = chances * table[:, 4:5]
+                kinds = chances.argmax(axis=1).astype(np.int64)
+                return table[:, :4], chances.max(axis=1), kinds, table[:, first + count :]
+    shape = "no table" if rows is None else str(rows.shape)
+    raise CannotConvert(
+        f"the model {model.name} is not of the YOLO family, or has other than {count} classes: it gives {shape}, and "
+        f"{plain} or {older} values a box were expected"
+    )
+
+
+def _mask(weights: Array, prototypes: Array, side: int, box: tuple[float, float, float, float]) -> NDArray[np.bool_]:
+    """The pixels of a box that belong to the thing."""
+    import cv2
+
+    count, h, w = prototypes.shape
+    low = (weights @ prototypes.reshape(count, -1)).reshape(h, w)
+    full = cv2.resize(np.ascontiguousarray(low, np.float32), (side, side), interpolation=cv2.INTER_LINEAR)
+    x0, y0, x1, y1 = int(box[0]), int(box[1]), int(np.ceil(box[2])), int(np.ceil(box[3]))
+    return np.asarray(full[y0:y1, x0:x1] > 0.0)  # the sigmoid is above a half where its argument is above 0
+
+
+def _without_twice(found: list[Found]) -> list[Found]:
+    """Non-maximum suppression over all tiles, class by class; the surest first."""
+    import cv2
+
+    if not found:
+        return []
+    found = sorted(found, key=lambda f: (-f.score, f.box))[:MOST]
+    boxes = [(f.box[0], f.box[1], f.box[2] - f.box[0], f.box[3] - f.box[1]) for f in found]
+    kinds = [f.kind for f in found]
+    kept = cv2.dnn.NMSBoxesBatched(boxes, [f.score for f in found], kinds, 0.0, SAME)
+    return [found[k] for k in sorted(int(i) for i in np.asarray(kept).ravel())]
