@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -43,22 +43,30 @@ def offline(
 
     Raises what reading and planning raise; see ``app.bundle.read`` and ``app.convert.recipe.chain``.
     """
+    return _offline(lambda: files, to, hints or Hints(), datum, options or {}, limits or Limits(), derived)
+
+
+def _offline(
+    load: Callable[[], Files],
+    to: str,
+    hints: Hints,
+    datum: Datum | None,
+    options: Mapping[str, str],
+    limits: Limits,
+    derived: bool,
+) -> Converted:
+    """``offline`` of files that are loaded when they are read, and not held while the map is made."""
     known = formats.get_format(to)
-    asked = dict(options or {})
+    asked = dict(options)
     recipes.own_options(known, asked)
-    limits = limits or Limits()
-    unpacked = bundle.unpack(files, limits)
-    hints = hints or Hints()
     needed: frozenset[Layer] = known.needs.also.union(*known.needs.one_of)
     wanted = None if "objects" in needed else needed  # whatever can be read can be an object
     while True:
-        told = bundle.read(
-            unpacked, hints, Known(datum, None, wanted, not known.outlines, known.drawing or known.holds), limits
-        )
+        knowing = Known(datum, None, wanted, not known.outlines, known.drawing or known.holds)
+        told = bundle.read(bundle.unpack(load(), limits), hints, knowing, limits)
         have = told.layers(datum).layers
         if not asked and any(layers <= have for layers in known.needs.one_of):
-            # Nothing is asked by name and nothing has to be derived: not read again, and who sent it need not keep it.
-            wanted, files, unpacked = None, {}, {}
+            wanted = None  # nothing is asked by name and nothing has to be derived: not read again
         try:
             written = _made(known, told, datum, asked, derived=derived)
             break
@@ -100,11 +108,6 @@ def offline_paths(
     limits: Limits,
 ) -> Converted:
     """The same from spooled files: what a worker process is asked to do."""
-    return offline(
-        {name: path.read_bytes() for name, path in paths.items()},
-        to,
-        hints=hints,
-        datum=datum,
-        options=options,
-        limits=limits,
+    return _offline(
+        lambda: {name: path.read_bytes() for name, path in paths.items()}, to, hints, datum, options, limits, True
     )

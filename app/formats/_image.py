@@ -10,7 +10,7 @@ import io
 import re
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,7 +102,7 @@ def read_image(data: bytes, limits: Limits) -> Image.Image:
         pixels, _ = _read_pgm(data, limits).pixels()
         return Image.fromarray(pixels)
     if kind == "png":
-        data = _checked_png(data, limits)
+        data = b"".join(_checked_png(data, limits))
     elif kind == "jpeg":
         _check_jpeg(data)
     names = {"png": "PNG", "jpeg": "JPEG", "bmp": "BMP", "pgm": "PPM"}
@@ -130,17 +130,17 @@ def encode_png(pixels: Bytes, *, flip: bool = False, palette: Bytes | None = Non
     height, width = pixels.shape[:2]
     bands = 1 if pixels.ndim == 2 else pixels.shape[2]
     colour = 3 if palette is not None else {1: 0, 2: 4, 3: 2, 4: 6}[bands]
-    out: list[bytes | memoryview] = [
-        PNG_MAGIC,
-        _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, colour, 0, 0, 0)),
-    ]
+    out = io.BytesIO()  # whose content is taken out without a copy
+    out.write(PNG_MAGIC)
+    out.write(_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, colour, 0, 0, 0)))
     if palette is not None:
-        out += [_chunk(b"PLTE", palette[:, :3].tobytes()), _chunk(b"tRNS", palette[:, 3].tobytes())]
+        out.write(_chunk(b"PLTE", palette[:, :3].tobytes()))
+        out.write(_chunk(b"tRNS", palette[:, 3].tobytes()))
     # Grids are runs of few values: matching runs alone is as quick as the fastest general level, half the size, and
     # keeps to filter 0.
     packer = zlib.compressobj(1, zlib.DEFLATED, 15, 9, zlib.Z_RLE if bands == 1 else zlib.Z_DEFAULT_STRATEGY)
     rows = max(1, STRIP // (width * bands))
-    packed = []
+    packed = _Packed(out)
     for y in range(0, height, rows):
         end = min(height, y + rows)
         block = pixels[height - end : height - y][::-1] if flip else pixels[y:end]
@@ -148,16 +148,47 @@ def encode_png(pixels: Bytes, *, flip: bool = False, palette: Bytes | None = Non
         lines[:, 1:] = block.reshape(end - y, width * bands)
         if table is not None:
             lines[:, 1:] = look_up(lines[:, 1:], table)
-        packed.append(packer.compress(lines.data))
-    packed.append(packer.flush())
-    body = b"".join(packed)
-    del packed  # the packed pixels may be as large as the picture: no more than two copies of them at a time
-    limit = 2**30
-    pieces = [memoryview(body)[i : i + limit] for i in range(0, len(body), limit)]
-    for piece in pieces:
-        sum_of = zlib.crc32(piece, zlib.crc32(b"IDAT"))
-        out += [struct.pack(">I", len(piece)) + b"IDAT", piece, struct.pack(">I", sum_of)]
-    return b"".join([*out, _chunk(b"IEND", b"")])
+        packed.write(packer.compress(lines.data))
+    packed.write(packer.flush())
+    packed.close()
+    out.write(_chunk(b"IEND", b""))
+    return out.getvalue()
+
+
+class _Packed:
+    """The IDAT chunks of a PNG, of up to 2^30 bytes each, written as they come: the packed pixels may be as large as
+    the picture, and are in memory once."""
+
+    MOST = 2**30
+
+    def __init__(self, out: io.BytesIO) -> None:
+        self.out = out
+        self.begin()
+
+    def begin(self) -> None:
+        """Leave room for the length of a chunk."""
+        self.size, self.sum = 0, zlib.crc32(b"IDAT")
+        self.out.write(bytes(4) + b"IDAT")
+
+    def write(self, packed: bytes) -> None:
+        """Append some of the packed pixels."""
+        rest = memoryview(packed)
+        while rest:
+            if self.size == self.MOST:
+                self.close()
+                self.begin()
+            part = rest[: self.MOST - self.size]
+            self.out.write(part)
+            self.size += len(part)
+            self.sum = zlib.crc32(part, self.sum)
+            rest = rest[len(part) :]
+
+    def close(self) -> None:
+        """Finish the chunk: its checksum, and its length where it begins."""
+        self.out.write(struct.pack(">I", self.sum))
+        self.out.seek(-12 - self.size, io.SEEK_END)
+        self.out.write(struct.pack(">I", self.size))
+        self.out.seek(0, io.SEEK_END)
 
 
 def png_of_cells(cells: Bytes) -> bytes:
@@ -325,9 +356,68 @@ def _grey_and_opaque(rgba: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
     return ((total + 500_000) // 1_000_000).astype(np.uint8), opaque
 
 
-def _checked_png(data: bytes, limits: Limits) -> bytes:
-    """The PNG with only the chunks that make its pixels, each one's checksum verified (Pillow skips that of IDAT)."""
-    at, kept, packed = 8, [data[:8]], 0
+def png_pixels(data: bytes, limits: Limits) -> Bytes | None:
+    """uint8 [height, width, bands] of a PNG of 8-bit RGB, RGBA or grey + alpha; None for any other picture.
+
+    Pillow keeps such pixels in 4 bytes each, whatever their bands. Here it is given a strip of rows at a time, as a
+    picture of its own that begins with the row before it, so that no more than the result takes memory.
+    Raises UnreadableFile or TooLarge, as ``read_image``.
+    """
+    if kind_of(data) != "png":
+        return None
+    chunks = _checked_png(data, limits)
+    width, height, depth, colour, _, _, interlaced = struct.unpack(">IIBBBBB", chunks[1][8:21])
+    mode = {2: "RGB", 4: "LA", 6: "RGBA"}.get(colour)
+    if mode is None or depth != 8 or interlaced or any(chunk[4:8] == b"tRNS" for chunk in chunks[1:]):
+        return None
+    bands = len(mode)
+    pixels = np.empty((height, width, bands), np.uint8)
+    line, rows = 1 + width * bands, max(1, STRIP // width)
+    packed = _inflated(chunk[8:-4] for chunk in chunks[1:] if chunk[4:8] == b"IDAT")
+    next(packed)
+    before = bytes(line)
+    try:
+        for y in range(0, height, rows):
+            end = min(height, y + rows)
+            lines = packed.send((end - y) * line)
+            if len(lines) < (end - y) * line:
+                raise UnreadableFile("the PNG picture is damaged or cut short: its pixels end before their end")
+            head = struct.pack(">IIBBBBB", width, 1 + end - y, 8, colour, 0, 0, 0)
+            body = zlib.compress(before + lines, 0)
+            strip = b"".join([PNG_MAGIC, _chunk(b"IHDR", head), _chunk(b"IDAT", body), _chunk(b"IEND", b"")])
+            with Image.open(io.BytesIO(strip), formats=["PNG"]) as image:
+                pixels[y:end] = np.asarray(image)[1:]
+            before = b"\0" + pixels[end - 1].tobytes()
+    except (OSError, SyntaxError, ValueError, EOFError, zlib.error) as error:
+        raise UnreadableFile(f"the PNG picture is damaged or cut short: {error}") from error
+    return pixels
+
+
+def _inflated(chunks: Iterator[memoryview]) -> Generator[bytes, int, None]:
+    """The unfolded content of a zlib stream: send how many bytes are wanted next (fewer come at its end)."""
+    unfold = zlib.decompressobj()
+    pieces = (chunk[k : k + 2**14] for chunk in chunks for k in range(0, len(chunk), 2**14))
+    rest: bytes | memoryview = b""
+    wanted = yield b""
+    while True:
+        out = []
+        while wanted > 0 and not unfold.eof:
+            # With nothing new there may still be something that did not fit before.
+            part = unfold.decompress(rest, wanted)
+            rest = unfold.unconsumed_tail
+            if not part and not rest:
+                rest = next(pieces, b"")
+                if not rest:
+                    break
+            out.append(part)
+            wanted -= len(part)
+        wanted = yield b"".join(out)
+
+
+def _checked_png(data: bytes, limits: Limits) -> list[memoryview]:
+    """The PNG's signature and the chunks that make its pixels, each one's checksum verified (Pillow skips IDAT's)."""
+    view = memoryview(data)
+    at, kept, packed = 8, [view[:8]], 0
     width = height = depth = colour = 0
     palette = False
     while True:
@@ -346,7 +436,7 @@ def _checked_png(data: bytes, limits: Limits) -> bytes:
             _check_size(width, height, limits)
         palette = palette or kind == b"PLTE"
         if kind in (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"):
-            kept.append(data[at:end])
+            kept.append(view[at:end])
             packed += size if kind == b"IDAT" else 0
         elif not kind[0] & 0x20:
             raise UnreadableFile(f"the PNG picture needs the unknown chunk {kind!r}")
@@ -358,7 +448,7 @@ def _checked_png(data: bytes, limits: Limits) -> bytes:
     bits = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 1) * depth
     if (width * bits // 8) * height > packed * DEFLATE_RATIO:
         raise UnreadableFile(f"the PNG picture says {width} × {height} pixels, but {packed} bytes cannot hold them")
-    return b"".join(kept)
+    return kept
 
 
 def _check_jpeg(data: bytes) -> None:

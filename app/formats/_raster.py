@@ -19,10 +19,13 @@ from numpy.typing import NDArray
 
 from app.errors import BadUpload, TooLarge, UnreadableFile
 from app.formats import Limits
-from app.model.gdal import DATA_TYPES, gdal, native, opened
+from app.model.gdal import CACHE, DATA_TYPES, gdal, native, opened, taken
 from app.model.imagery import LOCAL, Affine, Picture
 
 NO_TRANSFORM: Affine = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+
+BLOCK = 512
+"""Pixels along each side of a written tile."""
 
 OWN_TAG = "FLEETMAP_CRS"
 """Our own metadata item: ``local`` where the coordinates are metres of the local frame, which no CRS names."""
@@ -198,7 +201,9 @@ def _decoded(dataset: Any, rasterio: Any) -> Raster:
     } & set(flags)
     kind = np.dtype(dataset.dtypes[0])
     pixels = np.empty((count + masked, height, width), kind)
-    dataset.read(out=pixels[:count])
+    for window in _windows(dataset, rasterio):
+        rows, columns = window.toslices()
+        dataset.read(out=pixels[:count, rows, columns], window=window)
     if masked:
         full = 127 if kind == np.int8 else 255
         np.multiply(dataset.read_masks(1) != 0, full, out=pixels[count], casting="unsafe")
@@ -254,6 +259,18 @@ def _decoded(dataset: Any, rasterio: Any) -> Raster:
     return Raster(np.moveaxis(pixels, 0, 2), transform, crs, properties, tuple(doubts))
 
 
+def _windows(dataset: Any, rasterio: Any) -> Iterator[Any]:
+    """Parts of a picture that are read at a time: whole blocks, no more than the cache holds. (GDAL reads line by line,
+    and would decode each tile of a wide picture again for each line.)"""
+    high, wide = dataset.block_shapes[0]
+    room = CACHE // 2 // (dataset.count * np.dtype(dataset.dtypes[0]).itemsize)
+    columns = max(1, room // (high * wide)) * wide
+    rows = max(1, room // (high * min(columns, dataset.width))) * high
+    for y in range(0, dataset.height, rows):
+        for x in range(0, dataset.width, columns):
+            yield rasterio.windows.Window(x, y, min(columns, dataset.width - x), min(rows, dataset.height - y))
+
+
 def _unless(value: float, usual: float) -> float | None:
     """A number that says something: finite, and not the usual one."""
     return float(value) if math.isfinite(value) and value != usual else None
@@ -303,18 +320,20 @@ def write_cog(picture: Picture, crs: str | None, tags: Mapping[str, str]) -> byt
         "COMPRESS": "DEFLATE",
         "PREDICTOR": "YES",
         "LEVEL": "6",
-        "BLOCKSIZE": "512",
+        "BLOCKSIZE": str(BLOCK),
         "BIGTIFF": "IF_SAFER",
         "NUM_THREADS": "1",
         "OVERVIEW_RESAMPLING": "NEAREST" if "palette" in colours or not _is_shade(picture) else "AVERAGE",
     }
-    with gdal() as rasterio, MemoryFile() as out:
+    # Room for two rows of the largest overview's tiles, which are written once only if they are there in full.
+    cache = max(CACHE // 4, BLOCK * pixels.shape[1] * pixels.shape[2] * pixels.itemsize)
+    with gdal(cache) as rasterio, MemoryFile() as out:
         with opened(rasterio, pixels, count, described=True) as dataset:
             _describe(dataset, picture, colours[:count], crs, tags, rasterio)
             if masked:
                 dataset.write_mask(pixels[..., count] != 0)
             shutil.copy(dataset, out.name, driver="COG", **options)
-        return bytes(out.getbuffer())
+        return taken(out.getbuffer())
 
 
 def _is_shade(picture: Picture) -> bool:

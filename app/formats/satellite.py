@@ -211,28 +211,32 @@ def read(files: Files, context: ReadContext) -> Layers:
 def _decoded(data: bytes, limits: Limits) -> _raster.Raster:
     if _raster.is_tiff(data):
         return _raster.read_tiff(data, limits)
-    image = _image.read_image(data, limits)
-    if image.mode.startswith("I"):
-        pixels = _pixels(image, np.uint16)
-    else:
-        clear = "transparency" in image.info or image.mode in ("LA", "PA", "RGBA", "La", "RGBa")
-        grey = image.mode in ("1", "L", "LA", "La")
-        mode = ("LA" if clear else "L") if grey else ("RGBA" if clear else "RGB")
-        if image.mode != mode:
-            if "transparency" in image.info and mode == "LA":
-                image = image.convert("RGBA")
-            image = image.convert(mode)
-        pixels = _pixels(image, np.uint8)
+    pixels = _image.png_pixels(data, limits)
+    if pixels is None:
+        image = _image.read_image(data, limits)
+        if image.mode.startswith("I"):
+            pixels = _pixels(image, image.mode, np.uint16)
+        else:
+            clear = "transparency" in image.info or image.mode in ("LA", "PA", "RGBA", "La", "RGBa")
+            grey = image.mode in ("1", "L", "LA", "La")
+            pixels = _pixels(image, ("LA" if clear else "L") if grey else ("RGBA" if clear else "RGB"), np.uint8)
     bands = [{"colour": colour} for colour in USUAL_COLOURS[pixels.shape[2]]]
     return _raster.Raster(pixels, None, None, {"bands": bands})
 
 
-def _pixels(image: Image.Image, kind: type[np.generic]) -> NDArray[Any]:
-    """[height, width, bands], a strip of rows at a time: Pillow's own way takes twice the memory."""
-    out = np.empty((image.height, image.width, len(image.getbands())), kind)
+def _pixels(image: Image.Image, mode: str, kind: type[np.generic]) -> NDArray[Any]:
+    """[height, width, bands] of a picture in this mode, a strip of rows at a time: Pillow's own way takes twice the
+    memory."""
+    bands = len(Image.new(mode, (1, 1)).getbands())
+    out = np.empty((image.height, image.width, bands), kind)
     rows = max(1, _image.STRIP // image.width)
     for y in range(0, image.height, rows):
-        part = np.asarray(image.crop((0, y, image.width, min(image.height, y + rows))))
+        some = image.crop((0, y, image.width, min(image.height, y + rows)))
+        if some.mode != mode:
+            if "transparency" in some.info and mode == "LA":
+                some = some.convert("RGBA")
+            some = some.convert(mode)
+        part = np.asarray(some)
         out[y : y + rows] = part if part.ndim == 3 else part[..., None]
     return out
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import io
 import logging
+import mmap
+import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -30,13 +34,14 @@ DATA_TYPES = {
 
 
 @contextlib.contextmanager
-def gdal() -> Iterator[Any]:
+def gdal(cache: int = CACHE) -> Iterator[Any]:
     """GDAL with a small cache, deaf to files beside the one it is given. Gives rasterio, which is slow to import."""
     import rasterio  # type: ignore[import-untyped]
 
     logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # what it has to say is raised, too
     settings = {
-        "GDAL_CACHEMAX": CACHE,
+        "GDAL_CACHEMAX": cache,
+        "COG_TMP_COMPRESSION": "DEFLATE",  # of overviews until they are in place; LZW makes noise larger than it is
         "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
         "GDAL_MEM_ENABLE_OPEN": "YES",
         "GDAL_NUM_THREADS": "1",
@@ -46,6 +51,34 @@ def gdal() -> Iterator[Any]:
     with rasterio.Env(**settings), warnings.catch_warnings():
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
         yield rasterio
+
+
+PIECE = 2**24
+"""Bytes of a finished file that are taken over at a time."""
+
+
+def taken(buffer: memoryview) -> bytes:
+    """The content of a file that GDAL has made in memory and nobody reads again: its pages are given back to the system
+    as they are copied, so that a large one is not in memory twice. The buffer holds nothing after that."""
+    whole = np.frombuffer(buffer, np.uint8)
+    free = _free()
+    page, start = mmap.PAGESIZE, whole.__array_interface__["data"][0]
+    out = io.BytesIO()
+    for k in range(0, len(whole), PIECE):
+        out.write(whole[k : k + PIECE])
+        low, high = -(-(start + k) // page) * page, (start + min(k + PIECE, len(whole))) // page * page
+        if free is not None and k + PIECE <= len(whole):
+            free(low, high - low)
+    return out.getvalue()
+
+
+def _free() -> Callable[[int, int], Any] | None:
+    """(address, size) -> the pages there hold nothing any more; None where the system has no such call."""
+    call = getattr(ctypes.CDLL(None), "madvise", None) if sys.platform == "linux" else None
+    if call is None:
+        return None
+    call.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
+    return lambda at, size: call(at, size, mmap.MADV_DONTNEED)
 
 
 def native(pixels: NDArray[Any]) -> NDArray[Any]:

@@ -134,6 +134,90 @@ def building(vertices: int) -> Callable[[float], dict[str, bytes]]:
     return make
 
 
+def graph(vertices: int) -> Callable[[float], dict[str, bytes]]:
+    """A navigation graph as ``building_map_generator nav`` writes one: a hall of aisles, a third of the places named."""
+
+    def make(scale: float) -> dict[str, bytes]:
+        dice = np.random.default_rng(SEED)
+        side = max(3, round((vertices * scale) ** 0.5))
+        places = dice.uniform(-0.3, 0.3, (side, side, 2)) + np.indices((side, side)).transpose(1, 2, 0) * 2
+        ids = np.arange(side * side).reshape(side, side)
+        pairs = np.concatenate([np.stack([ids[:, :-1], ids[:, 1:]], -1).reshape(-1, 2), np.stack([ids[:-1], ids[1:]], -1).reshape(-1, 2)])  # fmt: skip  # noqa: E501
+        both = np.stack([pairs, pairs[:, ::-1]], 1).reshape(-1, 2).tolist()
+        lanes = [f"    - - {a}\n      - {b}\n      - {{speed_limit: 0.5}}" for a, b in both]
+        names = [f"place_{k}" if k % 3 == 0 else "''" for k in range(side * side)]
+        named = zip(places.reshape(-1, 2).tolist(), names, strict=True)
+        rows = [f"    - - {x!r}\n      - {y!r}\n      - {{name: {name}}}" for (x, y), name in named]
+        text = ["building_name: hall", "doors: {}", "levels:", "  L1:", "    lanes:", *lanes, "    vertices:", *rows]
+        return {"0.yaml": "\n".join([*text, "lifts: {}", ""]).encode()}
+
+    return make
+
+
+def lanes(count: int) -> Callable[[float], dict[str, bytes]]:
+    """Streets of lanelets, five points on each bound, as Autoware's editors write them: degrees, metres, elevation."""
+
+    def make(scale: float) -> dict[str, bytes]:
+        dice = np.random.default_rng(SEED)
+        streets = max(2, round((count * scale / 4) ** 0.5))
+        length = 4 * streets
+        points, ways, relations = [], [], []
+        x = np.arange(4 * length + 1) * 2.5
+        for street in range(streets):
+            first = []
+            for side in range(2):
+                y = 40.0 * street + 3.5 * side + np.cumsum(dice.normal(0, 0.02, len(x)))
+                z = 40 + np.cumsum(dice.normal(0, 0.01, len(x)))
+                first.append(len(points) + 1)
+                points += [
+                    f'  <node id="{k}" lat="{35.2 + b / 111_000:.11f}" lon="{138.8 + a / 91_000:.11f}">\n'
+                    f'    <tag k="local_x" v="{a:.4f}"/>\n    <tag k="local_y" v="{b:.4f}"/>\n'
+                    f'    <tag k="ele" v="{c:.4f}"/>\n  </node>'
+                    for k, (a, b, c) in enumerate(zip(x.tolist(), y.tolist(), z.tolist(), strict=True), first[-1])
+                ]
+            for lane in range(length):
+                number = 10**8 + 3 * (street * length + lane)
+                for side in range(2):
+                    refs = "".join(f'\n    <nd ref="{first[side] + 4 * lane + k}"/>' for k in range(5))
+                    ways.append(
+                        f'  <way id="{number + side}">{refs}\n    <tag k="type" v="line_thin"/>\n'
+                        '    <tag k="subtype" v="solid"/>\n  </way>'
+                    )
+                tags = {"type": "lanelet", "subtype": "road", "speed_limit": str(30 + 10 * (street % 3)), "location": "urban", "one_way": "yes"}  # fmt: skip  # noqa: E501
+                relations.append(
+                    f'  <relation id="{number + 2}">\n    <member type="way" role="left" ref="{number + 1}"/>\n'
+                    f'    <member type="way" role="right" ref="{number}"/>'
+                    + "".join(f'\n    <tag k="{k}" v="{v}"/>' for k, v in tags.items())
+                    + "\n  </relation>"
+                )
+        head = ['<?xml version="1.0" encoding="UTF-8"?>', '<osm generator="VMB">']
+        return {"map.osm": "\n".join([*head, *points, *ways, *relations, "</osm>", ""]).encode()}
+
+    return make
+
+
+def photo(end: str, noise: float) -> Callable[[float], dict[str, bytes]]:
+    """An aerial picture of 8000 × 8000 pixels, red, green and blue: fields, and noise of this width on every pixel."""
+
+    def make(scale: float) -> dict[str, bytes]:
+        from app.model.imagery import Picture
+
+        dice = np.random.default_rng(SEED)
+        side = max(8, round(PIXELS**0.5 * scale**0.5))
+        pixels = np.empty((side, side, 3), np.uint8)
+        x = np.arange(side)
+        for y in range(side):
+            shade = (np.sin(x / 70) + np.cos(y / 90)) * 60 + 120
+            grain = dice.integers(0, 256, (side, 3)) if noise >= 256 else dice.normal(0, noise, (side, 3))
+            pixels[y] = grain if noise >= 256 else np.clip(shade[:, None] + np.array([0, 10, 20]) + grain, 0, 255)
+        picture = Picture(pixels, (0.1, 0.0, 665000.0, 0.0, -0.1, 5905000.0), "EPSG:32630")
+        known = formats.get_format("satellite")
+        options = formats.write_options(known, {"file_type": end})
+        return formats.write(known, Layers({PartKey("imagery"): picture}), formats.WriteContext(options=options))
+
+    return make
+
+
 def grid(end: str) -> Callable[[float], dict[str, bytes]]:
     """A grid of 5714 × 3197 cells: rooms, noise, the unknown around them."""
 
@@ -169,6 +253,10 @@ def cloud(scale: float) -> dict[str, bytes]:
 
 
 CELLS = 5714 * 3197
+PIXELS = 8000 * 8000
+FIELD = Datum(53.27, -0.52)
+TURNED = 4 * 8256 * 8256
+"""Bytes of the picture of so many pixels in a local frame's axes, which has a band more: where there is a picture."""
 CASES = {
     case.name: case
     for case in (
@@ -182,9 +270,20 @@ CASES = {
         Case("OSM of 20 MB → osm", osm(80_000), "osm", bounded=True),
         Case("OSM of 20 MB → tmap2", osm(80_000), "tmap2", bounded=True),
         Case("building of 20 MB → openrmf", building(55_000), "openrmf", bounded=True),
+        Case("building of 20 MB → rmf_nav_graph", building(55_000), "rmf_nav_graph", bounded=True),
+        Case("navigation graph of 20 MB → rmf_nav_graph", graph(85_000), "rmf_nav_graph", bounded=True),
+        Case("Lanelet2 of 30 MB → lanelet2", lanes(14_500), "lanelet2", bounded=True),
+        Case("Lanelet2 of 30 MB → tmap2", lanes(14_500), "tmap2", bounded=True, datum=Datum(35.2, 138.8)),
         Case("points of 20 MB of text → octomap", cloud, "octomap", bounded=True),
         Case("grid of 5714 × 3197, PGM → PGM", grid("pgm"), "occupancy_grid", CELLS, bounded=True),
         Case("grid of 5714 × 3197, PNG → PNG", grid("png"), "occupancy_grid", CELLS, True, {"file_type": "png"}),
+        Case("picture of 8000 × 8000, PNG → TIFF", photo("png", 4), "satellite", 3 * PIXELS, True),
+        Case("picture of 8000 × 8000, PNG → PNG", photo("png", 4), "satellite", 3 * PIXELS, True, {"file_type": "png"}),
+        Case("picture of 8000 × 8000, TIFF → TIFF", photo("tif", 4), "satellite", 3 * PIXELS, True),
+        Case(
+            "picture of 8000 × 8000, TIFF → local", photo("tif", 4), "satellite", TURNED, True, {"crs": "local"}, FIELD
+        ),  # fmt: skip  # noqa: E501
+        Case("noise of 8000 × 8000, TIFF → TIFF", photo("tif", 256), "satellite", 3 * PIXELS, True),
     )
 }
 SMALL = 0.002

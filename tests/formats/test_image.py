@@ -327,3 +327,77 @@ def test_kind_is_judged_by_content(make: Callable[[bytes], bytes]) -> None:
     ends = {"png": "png", "pgm": "pgm", "ppm": "pgm", "pbm": "pgm", "bmp": "bmp", "jpg": "jpeg"}
     assert all(kind == ends[name.rpartition(".")[2]] for name, kind in kinds.items())
     assert _image.kind_of(make(b"Plain text")) is None
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA"])
+@pytest.mark.parametrize("shape", [(37, 53), (3000, 301), (1, 1)])
+def test_a_coloured_png_in_strips_is_what_pillow_decodes_in_one(mode: str, shape: tuple[int, int]) -> None:
+    dice = np.random.default_rng(3)
+    hills = np.add.outer(np.arange(shape[0]), np.arange(shape[1]))[..., None] // 3 + np.arange(len(mode)) * 40
+    pixels = (hills + dice.integers(0, 3, hills.shape)).astype(np.uint8)  # so that Pillow takes each of PNG's filters
+    data = saved(Image.fromarray(pixels, mode), "png")
+    told = _image.png_pixels(data, LIMITS)
+    assert told is not None
+    assert told.dtype == np.uint8
+    assert np.array_equal(told, pixels)
+
+
+def test_each_filter_of_a_png_and_many_small_chunks() -> None:
+    """The filters of the PNG specification (RFC 2083, 6), worked out by hand: each row is what the one before gives."""
+    width, bands = 2, 3
+    rows = [
+        bytes([0, 1, 2, 3, 4, 5, 6]),
+        bytes([1, 10, 10, 10, 1, 1, 1]),  # sub: left
+        bytes([2, 1, 1, 1, 1, 1, 1]),  # up
+        bytes([3, 1, 1, 1, 1, 1, 1]),  # half of left and up
+        bytes([4, 1, 1, 1, 1, 1, 1]),  # Paeth
+    ]
+    packed = zlib.compress(b"".join(rows))
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, len(rows), 8, 2, 0, 0, 0))
+    small = b"".join(chunk(b"IDAT", packed[k : k + 3]) for k in range(0, len(packed), 3))
+    told = _image.png_pixels(_image.PNG_MAGIC + header + small + chunk(b"IEND", b""), LIMITS)
+    assert told is not None
+    assert told.reshape(len(rows), width * bands).tolist() == [
+        [1, 2, 3, 4, 5, 6],
+        [10, 10, 10, 11, 11, 11],
+        [11, 11, 11, 12, 12, 12],
+        [6, 6, 6, 10, 10, 10],
+        [7, 7, 7, 11, 11, 11],
+    ]
+
+
+@pytest.mark.parametrize("name", ["L.png", "P.png", "1.png", "I;16.png", "RGB clear.png"])
+def test_other_pictures_are_left_to_pillow(name: str) -> None:
+    makers = {"L.png": "L", "P.png": "P", "1.png": "1", "I;16.png": "I;16", "RGB clear.png": "RGB"}
+    more = {"transparency": (1, 2, 3)} if "clear" in name else {}
+    assert _image.png_pixels(saved(Image.new(makers[name], (5, 4)), "png", **more), LIMITS) is None
+
+
+def test_a_coloured_png_that_ends_too_soon_is_refused() -> None:
+    short = png(2, 3, zlib.compress(b"\0" * 14), colour=2)  # 21 bytes are three rows
+    with pytest.raises(UnreadableFile, match="before their end"):
+        _image.png_pixels(short, LIMITS)
+    with pytest.raises(UnreadableFile, match="damaged"):
+        _image.png_pixels(png(2, 3, b"no zlib at all", colour=2), LIMITS)
+    with pytest.raises(UnreadableFile, match="damaged"):
+        _image.png_pixels(png(2, 3, zlib.compress(b"\x09" * 21), colour=2), LIMITS)
+
+
+def test_long_packed_pixels_stand_in_several_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = _image.encode_png(COLOURS)
+    monkeypatch.setattr(_image._Packed, "MOST", 1000)
+    parted = _image.encode_png(COLOURS)
+    assert parted.count(b"IDAT") == -(-whole.index(b"IEND") // 1000) > whole.count(b"IDAT") == 1
+    assert np.array_equal(np.asarray(Image.open(io.BytesIO(parted))), COLOURS)
+
+
+def test_memory_of_reading_a_coloured_png_stays_near_its_pixels() -> None:
+    data = saved(Image.fromarray(RANDOM.integers(0, 256, (3000, 2000, 3), np.uint8)), "png")
+    tracemalloc.start()
+    try:
+        told = _image.png_pixels(data, LIMITS)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert told is not None
+    assert peak < 1.5 * told.nbytes
