@@ -135,7 +135,7 @@ def building(vertices: int) -> Callable[[float], dict[str, bytes]]:
 
 
 def graph(vertices: int) -> Callable[[float], dict[str, bytes]]:
-    """A navigation graph as ``building_map_generator nav`` writes one: a hall of aisles, a third of the places named."""
+    """A navigation graph as ``building_map_generator nav`` writes one: a hall of aisles, some places named."""
 
     def make(scale: float) -> dict[str, bytes]:
         dice = np.random.default_rng(SEED)
@@ -282,7 +282,7 @@ CASES = {
         Case("picture of 8000 × 8000, TIFF → TIFF", photo("tif", 4), "satellite", 3 * PIXELS, True),
         Case(
             "picture of 8000 × 8000, TIFF → local", photo("tif", 4), "satellite", TURNED, True, {"crs": "local"}, FIELD
-        ),  # fmt: skip  # noqa: E501
+        ),
         Case("noise of 8000 × 8000, TIFF → TIFF", photo("tif", 256), "satellite", 3 * PIXELS, True),
     )
 }
