@@ -163,7 +163,10 @@ _NODE = re.compile(
 _HEAD = re.compile(rb'id="(-?\d{1,19})"' + _MORE + rb" ?(/?)>")
 _ND = re.compile(rb'<nd ref="(-?\d{1,19})" ?/>')
 _TAG = re.compile(rb'<tag k="([^"<\t\r\n]*)" v="([^"<\t\r\n]*)" ?/>')
-_MEMBER = re.compile(rb'<member type="(node|way|relation)" ref="(-?\d{1,19})" role="([^"<\t\r\n]*)" ?/>')
+_MEMBER = re.compile(
+    rb'<member type="(node|way|relation)" (?:ref="(-?\d{1,19})" role="([^"<\t\r\n]*)"'
+    rb'|role="([^"<\t\r\n]*)" ref="(-?\d{1,19})") ?/>'  # as Autoware's editors write it
+)
 _BOUNDS = re.compile(rb'<bounds((?>(?: [\w:.-]+="[^"<\t\r\n]*")*)) ?/>')
 
 
@@ -308,12 +311,15 @@ class _Children:
 
     def attributes(self, text: bytes) -> Attributes:
         """The attributes in this part of a tag."""
+        return self.mapping(_ATTRIBUTE.findall(text))
+
+    def mapping(self, found: list[tuple[bytes, bytes]]) -> dict[str, str]:
+        """Keys and values as texts. Mappings of the same keys share their table of keys."""
         texts = self.texts
-        found = _ATTRIBUTE.findall(text)
         keys = tuple([k for k, _ in found])
         pattern = self.alike.get(keys)
         if pattern is None:
-            if len(self.alike) >= PATTERNS:
+            if len(self.alike) >= PATTERNS or len(set(keys)) != len(keys):
                 return {texts[k]: texts[v] for k, v in found}
             pattern = self.alike[keys] = alike(*[texts[k] for k in keys])
         out = pattern.copy()
@@ -327,8 +333,7 @@ class _Children:
         self.tagged += len(found)
         if body.count(b"<") != len(found) + others:
             self.regular = False
-        texts = self.texts
-        out = {texts[k]: texts[v] for k, v in found}
+        out = self.mapping(found)
         if len(out) != len(found):
             # A key twice: the careful way tells of it.
             self.regular = False
@@ -358,7 +363,8 @@ def _scan_relations(data: bytes, children: _Children) -> list[Relation] | None:
         if head is None:
             return None
         end = head.end()
-        members = [(t.decode(), int(r), unescape(role)) for t, r, role in _MEMBER.findall(part, end)]
+        found = _MEMBER.findall(part, end)
+        members = [(t.decode(), int(r or other), unescape(role or named)) for t, r, role, named, other in found]
         children.members += len(members)
         tags = children.tags(part[end:], len(members))
         out.append(Relation(int(head[1]), members, tags, children.attributes(head[2])))

@@ -49,7 +49,7 @@ from app.formats._network import AMONG_PARTS, Edge, Net, joined, own
 from app.formats._osm import INT64, Data, Tags, Way, parse
 from app.formats._osm_text import NOTHING, as_texts, attribute_text, element_id, integers
 from app.formats._text import number
-from app.model.features import NO_GEOMETRY, Features, Properties, from_columns, unique_ids
+from app.model.features import NO_GEOMETRY, Compact, Features, Properties, from_columns, unique_ids
 from app.model.frame import MAX_DATUM_LATITUDE, MAX_METRES, Anchor, Datum
 from app.model.geodesy import local_frame
 from app.model.layers import NETWORK, Layers, Part, PartKey
@@ -147,7 +147,7 @@ class Places:
 
 def network(lanes: Sequence[Lane], places: Places, document: Properties) -> Features:
     """Nodes and directed edges of lanelets, all of whose points have a place."""
-    marks = _Ends()
+    marks, compact = _Ends(), Compact()
     rows: list[tuple[Lane, tuple[int, int], tuple[int, int], bool]] = []
     ids: list[str] = []
     geometry: list[Any] = []
@@ -189,10 +189,11 @@ def network(lanes: Sequence[Lane], places: Places, document: Properties) -> Feat
             said["width"] = widths[k]
         if (speed := speed_of(lane.tags.get("speed_limit"))) is not None:
             said["speed_limit"] = speed
-        said[NAME] = {"lanelet": lane.id, "tags": dict(lane.tags)}
+        said[NAME] = compact({"lanelet": lane.id, "tags": lane.tags})
+        said = compact(said)
         edges.append((lane.tags.get(EDGE) or f"l{lane.id}", lines[k], said))
         if both:
-            back = {**said, "source": target, "target": source}
+            back = compact({**said, "source": target, "target": source})
             edges.append((lane.tags.get(BACK) or f"l{lane.id}:back", shapely.reverse(lines[k]), back))
     for name, pair_ in used.items():
         if pair_ is None:
@@ -201,7 +202,7 @@ def network(lanes: Sequence[Lane], places: Places, document: Properties) -> Feat
             properties.append({"kind": "node", "name": label or name, NAME: {"point": places.names[name]}})
         else:
             at = (places.xyz[places.row[pair_[0]]] + places.xyz[places.row[pair_[1]]]) / 2.0
-            properties.append({"kind": "node", NAME: {"points": list(pair_)}})
+            properties.append(compact({"kind": "node", NAME: compact({"points": list(pair_)})}))
         ids.append(name)
         geometry.append(shapely.Point(*at[:2].tolist()) if math.isnan(at[2]) else shapely.Point(*at.tolist()))
     ids = unique_ids([*ids, *(i for i, _, _ in edges)])
@@ -459,6 +460,7 @@ class _Reader:
                 context.warn(f"{times} {text}")
         self.xyz = xyz
         self.known: dict[int, dict[str, Any]] = {}
+        self.compact = Compact()
         self.located = {i: k for i, k in row.items() if not lost[k]}
 
     def network(self) -> Features:
@@ -500,14 +502,14 @@ class _Reader:
             said = self.asked(k)
             if children := data.node_children.get(k):
                 said["children"] = [list(c) for c in children]
-            properties.append(_properties(said, tags, "point"))
+            properties.append(self.compact(_properties(said, tags, "point")))
         special_ids = {data.ids[k] for k in lone}
         deep = ~np.isnan(self.xyz[:, 2])
         for way in self.ways.values():
             said = self.way(way, special_ids)
             ids.append(f"w{way.id}")
             geometry.append(self.line(way, deep))
-            properties.append(_properties(said, way.tags, "line"))
+            properties.append(self.compact(_properties(said, way.tags, "line")))
         for r in self.relations.values():
             said = {"members": [list(m) for m in r.members], "tags": r.tags}
             if r.attributes:
@@ -516,7 +518,7 @@ class _Reader:
                 said["children"] = [list(c) for c in r.children]
             ids.append(f"r{r.id}")
             geometry.append(NO_GEOMETRY)
-            properties.append(_properties(said, r.tags, "relation"))
+            properties.append(self.compact(_properties(self.compact(said), r.tags, "relation")))
         out = np.empty(len(geometry), object)
         out[:] = geometry
         return from_columns(ids, out, properties, self.anchor, document)
@@ -549,7 +551,7 @@ class _Reader:
             said["vertices"] = mere[0] if all(b == mere[0] for b in mere) else bends
         if way.children:
             said["children"] = [list(c) for c in way.children]
-        return said
+        return self.compact(said)
 
     def bend(self, k: int) -> dict[str, Any]:
         """What is known of a point beside its place; one value for all ways that bend there."""
@@ -559,17 +561,13 @@ class _Reader:
         return known
 
     def asked(self, k: int) -> dict[str, Any]:
-        said: dict[str, Any] = {}
         tags = self.data.tags.get(k)
-        if tags:
-            said["tags"] = tags
-        if attributes := self.data.attributes(k):
-            said["attributes"] = attributes
+        attributes = self.data.attributes(k)
+        at = None
         if (tags and LOCAL[0] in tags) or self.anchor == "local":
             at = self.data.lonlat[k].tolist()
-            if not math.isnan(at[0]):
-                said["at"] = at
-        return said
+        said = {"tags": tags, "attributes": attributes, "at": None if at is None or math.isnan(at[0]) else at}
+        return self.compact({word: value for word, value in said.items() if value})
 
 
 def _table(
@@ -580,7 +578,7 @@ def _table(
     return Places({i: k for k, i in enumerate(located)}, xyz[rows].reshape(-1, 3), anchor, names, labels)
 
 
-def _properties(said: dict[str, Any], tags: Tags, otherwise: str) -> Properties:
+def _properties(said: dict[str, Any], tags: Tags, otherwise: str) -> dict[str, Any]:
     kind = tags.get("type") or otherwise
     if otherwise == "relation" and kind == "multipolygon":
         kind = "area"

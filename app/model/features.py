@@ -240,6 +240,29 @@ def alike(*keys: str) -> dict[str, Any]:
     return vars(holder)
 
 
+class Compact:
+    """Mappings -> the same ones in less memory: those with the same keys share their table of keys (``alike``)."""
+
+    MOST = 256
+    """Tables that are kept."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, ...], dict[str, Any]] = {}
+
+    def __call__(self, said: dict[str, Any]) -> dict[str, Any]:
+        """The mapping, with its keys in their order."""
+        keys = tuple(said)
+        pattern = self._known.get(keys)
+        if pattern is None:
+            if len(self._known) >= self.MOST:
+                return said
+            pattern = self._known[keys] = alike(*keys)
+        out = pattern.copy()
+        for key, value in said.items():
+            out[key] = value
+        return out
+
+
 def points(coordinates: NDArray[np.float64]) -> NDArray[np.object_]:
     """Point geometries from float64 [n, 2] or [n, 3]."""
     return np.asarray(shapely.points(coordinates), object).reshape(len(coordinates))

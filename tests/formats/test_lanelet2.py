@@ -22,7 +22,7 @@ from app.bundle import Hints, Known
 from app.bundle import read as read_bundle
 from app.convert import offline
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, get_format
+from app.formats import Group, Limits, ReadContext, WriteContext, _osm, get_format
 from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, speed_of, two_way
 from app.model.features import Features, features
 from app.model.frame import Datum
@@ -695,3 +695,19 @@ def test_odd_values_of_stored_words_do_no_harm() -> None:
             changed = edited(layers, key, lambda i, p, value=value: {**p, "lanelet2": value})  # type: ignore[misc]
             files, _ = write(Layers(changed.parts, Datum(0.0, 0.0)))
             etree.fromstring(files[MAIN])
+
+
+def test_members_as_autoware_writes_them_are_read_the_quick_way() -> None:
+    """type, role, ref: whichever order an editor has, the scan takes it and tells the same as the XML parser."""
+    head = '<?xml version="1.0"?>\n<osm version="0.6">\n  <node id="1" lat="35.2" lon="138.8"/>\n'
+    rows = [
+        'type="way" role="left" ref="-5"',
+        'type="way" ref="6" role="right &amp; more"',
+        'type="node" role="" ref="1"',
+    ]
+    members = "".join(f"    <member {row}/>\n" for row in rows)
+    data = f'{head}  <relation id="7">\n{members}    <tag k="type" v="lanelet"/>\n  </relation>\n</osm>\n'.encode()
+    quick, careful = _osm._scan(data, Limits(), False), _osm._events(data, Limits())
+    assert quick is not None
+    assert quick.relations == careful.relations
+    assert quick.relations[0].members == [("way", -5, "left"), ("way", 6, "right & more"), ("node", 1, "")]
