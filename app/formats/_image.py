@@ -368,12 +368,12 @@ def png_pixels(data: bytes, limits: Limits) -> Bytes | None:
     chunks = _checked_png(data, limits)
     width, height, depth, colour, _, _, interlaced = struct.unpack(">IIBBBBB", chunks[1][8:21])
     mode = {2: "RGB", 4: "LA", 6: "RGBA"}.get(colour)
-    if mode is None or depth != 8 or interlaced or any(chunk[4:8] == b"tRNS" for chunk in chunks[1:]):
+    if mode is None or depth != 8 or interlaced or any(bytes(chunk[4:8]) == b"tRNS" for chunk in chunks[1:]):
         return None
     bands = len(mode)
     pixels = np.empty((height, width, bands), np.uint8)
     line, rows = 1 + width * bands, max(1, STRIP // width)
-    packed = _inflated(chunk[8:-4] for chunk in chunks[1:] if chunk[4:8] == b"IDAT")
+    packed = _inflated(chunk[8:-4] for chunk in chunks[1:] if bytes(chunk[4:8]) == b"IDAT")
     next(packed)
     before = bytes(line)
     try:

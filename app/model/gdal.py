@@ -65,7 +65,7 @@ def taken(buffer: memoryview) -> bytes:
     page, start = mmap.PAGESIZE, whole.__array_interface__["data"][0]
     out = io.BytesIO()
     for k in range(0, len(whole), PIECE):
-        out.write(whole[k : k + PIECE])
+        out.write(whole[k : k + PIECE].data)
         low, high = -(-(start + k) // page) * page, (start + min(k + PIECE, len(whole))) // page * page
         if free is not None and k + PIECE <= len(whole):
             free(low, high - low)
