@@ -73,7 +73,8 @@ def create_derivation(
     """A version whose provenance says how the layer was made and from what. It goes stale when that changes.
 
     409 where a source has told that layer, unless `replace` is true. `location_to_imagery` fetches a picture of the
-    site where the operator has set up a provider (503 while that is down); it never goes stale.
+    site where the operator has set up a provider (503 while that is down); it goes stale when the fence or the datum
+    changes, and is still used then.
     """
     wish = Wish(body.method, body.parameters, body.replace)
     try:

@@ -122,6 +122,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("transform", "Between earth and local frame."),
             ("derivations", "What is computed from what, and committing it."),
             ("generations", "Sites made up from parameters and a seed."),
+            ("templates", "What is filled in where a format asks for more than the layers have."),
             ("formats", "What can be read, served and converted."),
             ("jobs", "Work that takes long."),
             ("tokens", "Access."),

@@ -234,6 +234,49 @@ class GenerationBody(In):
     replace: bool = Field(False, description="Whether what a source has told, or people have edited, gives way.")
 
 
+class FormatTemplatesBody(In):
+    """What is filled in where the format asks for more than the layers have."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={"examples": [{"values": {"action": "NavigateToPose", "xy_goal_tolerance": 0.4}}]},
+    )
+
+    set: str | None = Field(None, max_length=100, description="Another set than the environment's; see `/templates`.")
+    values: dict[str, Any] = Field(
+        default_factory=dict, max_length=100, description="By parameter of the format, as `/formats` lists them."
+    )
+    message: str = Field("", max_length=MAX_TEXT)
+    dry_run: bool = Field(False, description="Only say what would be.")
+
+
+class OwnTemplatesBody(In):
+    """One format's templates among others."""
+
+    set: str | None = Field(None, max_length=100)
+    values: dict[str, Any] = Field(default_factory=dict, max_length=100)
+
+
+class TemplatesBody(In):
+    """The set of an environment, and values for several formats at once."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={
+            "examples": [{"set": "outdoor", "formats": {"tmap2": {"values": {"xy_goal_tolerance": 0.4}}}}]
+        },
+    )
+
+    set: str | None = Field(None, max_length=100, description="A set's name; left out: it stays.")
+    formats: dict[str, OwnTemplatesBody] = Field(
+        default_factory=dict, max_length=100, description="What is said of these, instead of all that was."
+    )
+    message: str = Field("", max_length=MAX_TEXT)
+    dry_run: bool = Field(False, description="Only say what would be.")
+
+
 class RolloutBody(In):
     """A move in two stages. At least one of ``ready`` and ``failed``."""
 
@@ -511,9 +554,48 @@ class ReportOut(BaseModel):
     version: int
     layers: list[dict[str, Any]]
     attribution: list[str] = Field(description="Licences and credits of the sources, to be shown with the map.")
-    template: list[dict[str, Any]]
+    template: list[dict[str, Any]] = Field(
+        description="What was filled in: `what`, `value`, `why`, where a parameter says it `option`, and `from`: "
+        "`request`, `environment`, `set NAME` or `default`."
+    )
     dropped: list[dict[str, Any]]
     warnings: list[ProblemItem]
+
+
+class TemplateSetOut(BaseModel):
+    """A named set of values, by format and parameter."""
+
+    name: str
+    title: str
+    formats: dict[str, dict[str, Any]]
+
+
+class FormatTemplateOut(BaseModel):
+    """One format's templates. ``set``: where it is another than the environment's. ``ignored``: what was kept once and
+    this release cannot use."""
+
+    format: str
+    set: str | None
+    values: dict[str, Any]
+    effective: dict[str, dict[str, Any]]
+    ignored: list[str] | None = None
+
+
+class FormatTemplatesOut(FormatTemplateOut):
+    """A format's templates in a version of an environment."""
+
+    environment: str
+    version: int
+
+
+class TemplatesOut(BaseModel):
+    """A version's templates."""
+
+    environment: str
+    version: int
+    set: str
+    sets: list[str]
+    formats: list[FormatTemplateOut]
 
 
 class ChannelRobotsOut(BaseModel):

@@ -139,17 +139,19 @@ class Client:
         headers = {"Idempotency-Key": secrets.token_hex(16)} if repeat else {}
         return self._json(self._send("POST", path, json=_present(body), headers=headers, repeat=repeat))
 
-    def put(self, path: str, body: Mapping[str, Any]) -> Any:
+    def put(self, path: str, body: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> Any:
         """Put JSON."""
-        return self._json(self._send("PUT", path, json=_present(body), repeat=True))
+        return self._json(self._send("PUT", path, json=_present(body), headers=headers, repeat=True))
 
     def patch(self, path: str, body: Mapping[str, Any]) -> Any:
         """Change some members."""
         return self._json(self._send("PATCH", path, json=_present(body)))
 
-    def delete(self, path: str) -> Any:
+    def delete(
+        self, path: str, params: Mapping[str, Any] | None = None, headers: Mapping[str, str] | None = None
+    ) -> Any:
         """Delete what stands at a path."""
-        return self._json(self._send("DELETE", path, repeat=True))
+        return self._json(self._send("DELETE", path, params=_present(params), headers=headers, repeat=True))
 
     def pages(self, path: str, params: Mapping[str, Any], *, limit: int | None = None) -> Iterator[Any]:
         """All items of a list, or the first ``limit``; a page names the next one in ``Link: <…>; rel="next"``."""

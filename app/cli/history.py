@@ -151,6 +151,11 @@ def change_line(what: str, change: Any) -> str:
     """What changed and how: ``topology: 2 added``, ``datum: none → 53.25, -0.5``."""
     if what == "datum" and isinstance(change, Mapping):
         return f"datum: {_datum(change.get('from'))} → {_datum(change.get('to'))}"
+    if what == "templates" and isinstance(change, Mapping):
+        return f"templates: {', '.join(_template_changes(change))}"
+    if what == "renewed" and isinstance(change, list):
+        parts = ", ".join(f"{part['layer']} {part['level']}/{part['name']}" for part in change)
+        return f"derived anew with the same content: {parts}"
     return f"{what}: {counts(change)}"
 
 
@@ -177,6 +182,8 @@ def _lines(layer: str, change: Mapping[str, Any]) -> list[str]:
     """A layer's differences: of features by id, of grids by name with the cells counted."""
     if layer == "datum":
         return [f"~ {change_line(layer, change)}"]
+    if layer == "templates":
+        return [f"~ templates {line}" for line in _template_changes(change)]
     if not any(isinstance(change.get(kind), list) for kind in ("added", "changed", "deleted")):
         return [f"~ {layer} {name}: {counts(grid)}" for name, grid in change.items() if grid]
     lines = [f"+ {layer} {item}" for item in change.get("added", [])]
@@ -184,6 +191,19 @@ def _lines(layer: str, change: Mapping[str, Any]) -> list[str]:
         fields = ", ".join(item.get("fields") or ())
         lines.append(f"~ {layer} {item['id']}{f': {fields}' if fields else ''}")
     return lines + [f"- {layer} {item}" for item in change.get("deleted", [])]
+
+
+def _template_changes(change: Mapping[str, Any]) -> list[str]:
+    """``tmap2 action: none → NavigateToPose``, for each value that differs."""
+    out = []
+    for name, said in change.items():
+        if name == "set":
+            out.append(f"set: {said.get('from')} → {said.get('to')}")
+            continue
+        for parameter, values in said.items():
+            old, new = ("none" if values.get(end) is None else values[end] for end in ("from", "to"))
+            out.append(f"{name} {parameter}: {old} → {new}")
+    return out
 
 
 def _environments(limit: int, server: str | None, token: str | None, *, as_json: bool) -> None:

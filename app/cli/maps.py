@@ -261,7 +261,8 @@ def show_report(report: Mapping[str, Any]) -> None:
         name = "/".join(str(line[k]) for k in ("layer", "level", "name") if line.get(k))
         output.say(f"{name}: {line['information']}{f' ({steps})' if steps else ''}")
     for line in report.get("template") or ():
-        output.say(f"filled in: {line['what']} = {line['value']}: {line['why']}")
+        source = f" ({line['from']})" if line.get("from", "default") != "default" else ""
+        output.say(f"filled in: {line['what']} = {line['value']}{source}: {line['why']}")
     for line in report.get("dropped") or ():
         output.say(f"dropped: {line['count']} × {line['what']}: {line['why']}", style="yellow")
     output.show_warnings(report.get("warnings") or ())

@@ -16,6 +16,7 @@ from app.formats import Files, Format, Limits
 from app.model.frame import Datum
 from app.model.layers import Layer, Layers
 from app.store.values import PartEntry, Provenance
+from app.templates import REQUEST
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,9 @@ def _offline(
             if wanted is None:
                 raise
             wanted = None  # what the format carries is not in the files: read all they have, to derive it from
-    report = {**written.report, "warnings": [p.as_dict() for p in told.warnings] + written.report["warnings"]}
+    filled = making.labelled(written.report["template"], dict.fromkeys(asked, REQUEST))
+    report = {**written.report, "template": filled}
+    report |= {"warnings": [p.as_dict() for p in told.warnings] + written.report["warnings"]}
     return Converted(written.files, report, told.warnings)
 
 
@@ -96,7 +99,8 @@ def written(layers: Layers, to: str, options: Mapping[str, str], came: Provenanc
     entries = {key: PartEntry(key, "", 1, {}, came) for key in layers.parts}
     made = making.from_layers(known, layers, options, derived=True, entries=entries)
     left = making.not_carried(known, None, layers)
-    return Converted(made.files, {**made.report, "dropped": made.report["dropped"] + left})
+    filled = making.labelled(made.report["template"], dict.fromkeys(options, REQUEST))
+    return Converted(made.files, {**made.report, "template": filled, "dropped": made.report["dropped"] + left})
 
 
 def offline_paths(

@@ -18,8 +18,10 @@ from app.formats import Format, Inner, WriteContext, _archive
 from app.model.features import Features
 from app.model.frame import GROUND
 from app.model.layers import LAYERS, VECTOR_LAYERS, Layer, Layers, PartKey
+from app.model.templates import NO_TEMPLATES, Templates
 from app.store import Store
 from app.store.values import PartEntry, Version
+from app.templates import DEFAULT, resolve
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +47,7 @@ def make(
     loaded = store.load(version, way.keys)
     layers = Layers(loaded.parts, version.datum, version.levels)
     entries = {e.key: e for e in version.parts}
-    return write(known, layers, values, way, entries)
+    return write(known, layers, values, way, entries, templates=version.templates)
 
 
 def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) -> Hindrance | None:
@@ -80,15 +82,16 @@ def write(
     entries: Mapping[PartKey, PartEntry] | None = None,
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None = None,
     credit: Mapping[PartKey, Sequence[str]] | None = None,
+    templates: Templates = NO_TEMPLATES,
 ) -> Written:
     """Derive and write. ``entries`` (of a stored version) or ``origin`` and ``credit`` (of files) say where each part
-    came from, and under which licences and credits."""
+    came from, and under which licences and credits. templates: for the maps that a format holds."""
     notes = derive.Notes()
     made = derive.run(way.steps, layers, notes)
     context = WriteContext(options=recipes.own_options(known, values))
     inner: list[dict[str, Any]] = []
     if known.holds:
-        context.make = partial(_inner, entries, origin, credit, inner)
+        context.make = partial(_inner, entries, origin, credit, templates, inner)
     chosen = known.choose(sorted(k for k in made.parts if k.layer in known.carries), context.options)
     used = Layers({k: made.parts[k] for k in chosen}, made.datum, made.levels)
     noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
@@ -141,6 +144,7 @@ def _inner(
     entries: Mapping[PartKey, PartEntry] | None,
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None,
     credit: Mapping[PartKey, Sequence[str]] | None,
+    templates: Templates,
     derivations: list[dict[str, Any]],
     name: str,
     layers: Layers,
@@ -149,14 +153,15 @@ def _inner(
 ) -> Inner:
     """What ``WriteContext.make`` does; layers that were derived on the way are noted in ``derivations``."""
     known = formats.get_format(name)
-    made = from_layers(known, layers, values, derived=derived, entries=entries, origin=origin, credit=credit)
+    asked = {**resolve(templates, known).values, **values}
+    made = from_layers(known, layers, asked, derived=derived, entries=entries, origin=origin, credit=credit)
     report = made.report
     derivations += [line for line in report["layers"] if line["information"] == "derived"]
     return Inner(
         made.files,
         tuple(report["layers"]),
         tuple(report["dropped"]),
-        tuple(report["template"]),
+        tuple({**line, "format": known.name} for line in report["template"]),
         tuple(warnings_of(report)),
     )
 
@@ -231,6 +236,19 @@ def _ancestry(layer: Layer, steps: Mapping[Layer, Step]) -> tuple[set[Step], set
 def credits_of(lines: Iterable[Mapping[str, Any]]) -> list[str]:
     """The licences and credits of all layers of a report, each once."""
     return list(dict.fromkeys(text for line in lines for text in line.get("attribution", ())))
+
+
+def labelled(
+    lines: Iterable[Mapping[str, Any]], origin: Mapping[str, str], templates: Templates = NO_TEMPLATES
+) -> list[dict[str, Any]]:
+    """A report's template lines, each with where its value came ``from``. origin: of the map's own parameters; those of
+    maps inside it follow from the environment's templates."""
+    out = []
+    for line in lines:
+        inside = line.get("format")
+        said = origin if inside is None else resolve(templates, formats.get_format(str(inside))).origin
+        out.append({**line, "from": said.get(str(line.get("option")), DEFAULT)})
+    return out
 
 
 def not_carried(known: Format, entries: Mapping[PartKey, PartEntry] | None, layers: Layers) -> list[dict[str, Any]]:

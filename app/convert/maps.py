@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from app import formats, parameters
+from app import formats, parameters, templates
 from app.bundle import Hints
 from app.convert import files as direct
 from app.convert import make as making
@@ -60,10 +61,14 @@ class Maps:
     ) -> Recipe:
         """How the map would be made; cheap. Raises NotFound, Invalid, MissingLayer, MissingDatum, Ambiguous.
 
-        file: the one file of the map that is wanted; its name may say more (``keepout.yaml`` is the grid keepout).
+        values: what the request says; the environment's templates say the rest. file: the one file of the map that is
+        wanted; its name may say more (``keepout.yaml`` is the grid keepout).
         """
-        said = formats.get_format(name).by_file(file) if file else {}
-        asked = {**said, **(values or {})}
+        known = formats.get_format(name)
+        said = {**(known.by_file(file) if file else {}), **(values or {})}
+        filled = templates.resolve(version.templates, known)
+        asked = {**filled.values, **said}
+        origin = {**filled.origin, **dict.fromkeys(said, templates.REQUEST)}
         without: frozenset[str] = frozenset()
         failed: list[Hindrance] = []
         while True:
@@ -71,11 +76,11 @@ class Maps:
                 found = recipes.recipe(version, name, asked, derived=derive, without=without)
             except MissingLayer as error:
                 raise recipes.exhausted(error, failed) from error
-            known = self._tried.get(_content(version, found.chain)) if found.steps else None
-            if known is None or not known.step:
-                return found
-            without |= {known.step}
-            failed.append(known)
+            tried = self._tried.get(_content(version, found.chain)) if found.steps else None
+            if tried is None or not tried.step:
+                return replace(found, origin=origin)
+            without |= {tried.step}
+            failed.append(tried)
 
     def ready(self, recipe: Recipe) -> Made | None:
         """The map, only if it is made already."""
@@ -138,9 +143,17 @@ class Maps:
             }
             for k, why in used.items()
         ]
-        warnings = [*told["warnings"], *stale]
-        more = {"layers": lines, "attribution": credit, "dropped": dropped, "warnings": warnings}
+        ignored = [{"problem": reason} for reason in self._ignored(recipe)]
+        warnings = [*told["warnings"], *stale, *ignored]
+        filled = making.labelled(told["template"], recipe.origin, recipe.version.templates)
+        more = {"layers": lines, "attribution": credit, "template": filled, "dropped": dropped, "warnings": warnings}
         return {**told, "version": version, **more}
+
+    def _ignored(self, recipe: Recipe) -> list[str]:
+        """What the environment's templates say and this release cannot use."""
+        used = formats.all_formats().values() if recipe.format.holds else [recipe.format]
+        reasons = [reason for known in used for reason in templates.resolve(recipe.version.templates, known).ignored]
+        return list(dict.fromkeys(reasons))
 
     def coverage(self, version: Version) -> list[dict[str, Any]]:
         """For every format that can be served: direct, derivable or missing, by which chain, and what to supply."""
@@ -181,7 +194,9 @@ class Maps:
         unnamed: tuple[recipes.Chain, str | None] | None = None
         while True:
             try:
-                way = recipes.chain(known, available, known.write_options(), without=without)
+                said = templates.resolve(version.templates, known).values
+                options = formats.write_options(known, said)
+                way = recipes.chain(known, available, options, values=said, without=without)
             except MissingLayer as error:
                 if unnamed is not None:
                     return unnamed

@@ -14,12 +14,13 @@ from typing import Any
 
 import orjson
 
-from app import __version__, derive, formats, parameters
+from app import __version__, derive, formats, parameters, templates
 from app.derive import Step
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingDatum, MissingLayer, Problem
 from app.formats import Format
 from app.model.features import Features
 from app.model.layers import LAYERS, MAP, Layer, Layers, PartKey
+from app.model.templates import Templates
 from app.store.values import PartEntry, Version
 
 SUPPLY: Mapping[Layer, str] = {
@@ -71,13 +72,17 @@ class Chain:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """One map of one version: everything ``make`` needs to know, and the key of what it will give."""
+    """One map of one version: everything ``make`` needs to know, and the key of what it will give.
+
+    origin: where the parameters that are no defaults came from (request, environment, a set); it is no part of the key.
+    """
 
     version: Version
     format: Format
     options: Any
     chain: Chain
     key: str
+    origin: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def etag(self) -> str:
@@ -123,11 +128,14 @@ def _pinned(version: Version, entries: Sequence[PartEntry]) -> dict[Layer, Mappi
     is stale).
     """
     stale = version.stale
+    known = derive.all_derivations()
     out: dict[Layer, Mapping[str, Mapping[str, Any]]] = {}
     for layer in {key.layer for key in stale}:
         parts = [e for e in entries if e.key.layer == layer]
         if all(e.key in stale and e.provenance.information == "derived" and not e.provenance.edited for e in parts):
             steps = [step for e in parts for step in e.provenance.steps]
+            if any(step.get("step") not in known for step in steps):
+                continue  # fetched from the net: no map does that by itself
             out[layer] = {str(s["step"]): dict(s.get("parameters") or {}) for s in steps if "step" in s}
     return out
 
@@ -309,6 +317,11 @@ def own_options(known: Format, values: Mapping[str, str]) -> Any:
     return formats.write_options(known, {n: v for n, v in values.items() if n in own or n not in steps})
 
 
+def defaults(said: Templates, known: Format) -> Any:
+    """The options of a format's writer as an environment's templates give them."""
+    return formats.write_options(known, templates.resolve(said, known).values)
+
+
 def _key(version: Version, known: Format, options: Any, way: Chain, entries: Mapping[PartKey, PartEntry]) -> str:
     ingredients: dict[str, Any] = {
         "server": __version__,
@@ -323,6 +336,10 @@ def _key(version: Version, known: Format, options: Any, way: Chain, entries: Map
     if known.holds:  # its bytes are those of other writers and, where they lack a layer, of derivations
         ingredients["formats"] = [[f.name, f.version] for f in formats.all_formats().values()]
         ingredients["derivations"] = [[d.name, d.version] for d in derive.all_derivations().values()]
+        said = {f.name: defaults(version.templates, f) for f in formats.all_formats().values() if f is not known}
+        said = {name: parameters.canonical(chosen) for name, chosen in said.items()}
+        if any(said.values()):
+            ingredients["templates"] = {name: values for name, values in said.items() if values}
     return hashlib.sha256(orjson.dumps(ingredients, option=orjson.OPT_SORT_KEYS)).hexdigest()
 
 

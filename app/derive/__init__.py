@@ -38,9 +38,10 @@ class Notes:
         if count:
             self.dropped.append({"what": what, "count": count, "why": why})
 
-    def fill(self, what: str, value: Any, why: str) -> None:
-        """No source says this: a default was taken."""
-        self.template.append({"what": what, "value": value, "why": why})
+    def fill(self, what: str, value: Any, why: str, option: str | None = None) -> None:
+        """No source says this: a default was taken. option: the parameter that says it."""
+        said = {} if option is None else {"option": option}
+        self.template.append({"what": what, "value": value, "why": why, **said})
 
 
 Function = Callable[[Layers, Any, Notes], Layers]

@@ -125,9 +125,10 @@ class WriteContext:
         if count:
             self.dropped.append({"what": what, "count": int(count), "why": why})  # also of NumPy's integers
 
-    def fill(self, what: str, value: Any, why: str) -> None:
-        """The format asks for this and no layer has it: a default was filled in."""
-        self.template.append({"what": what, "value": value, "why": why})
+    def fill(self, what: str, value: Any, why: str, option: str | None = None) -> None:
+        """The format asks for this and no layer has it: a default was filled in. option: the parameter that says it."""
+        said = {} if option is None else {"option": option}
+        self.template.append({"what": what, "value": value, "why": why, **said})
 
     def warn(self, problem: str, *, file: str | None = None, where: str | None = None) -> None:
         """The map was written, but its consumer may not like it."""

@@ -71,26 +71,16 @@ def ring(radius: float) -> list[dict[str, float]]:
 
 EDGE_TEMPLATE: Mapping[str, Any] = {
     "config": [],
-    "fail_policy": "fail",
-    "fluid_navigation": True,
     "goal": {"target_pose": {"header": {"frame_id": "$node.parent_frame"}, "pose": "$node.pose"}},
-    "recovery_behaviours_config": "",
-    "restrictions_planning": "True",
-    "restrictions_runtime": "True",
 }
-NODE_TEMPLATE: Mapping[str, Any] = {
-    "localise_by_topic": "",
-    "parent_frame": "map",
-    "restrictions_planning": "True",
-    "restrictions_runtime": "True",
-}
+"""What new edges get besides what the options say."""
+
+FRAME, ANYWHERE = "map", "True"
+"""Frame of nodes, and the restriction that forbids nothing."""
+
 TOLERANCES = {"xy_goal_tolerance": 0.3, "yaw_goal_tolerance": 0.1}
 ANY_YAW = 6.29
 """Yaw tolerance of a node whose orientation is not known: any."""
-
-LIST_EDGE: Mapping[str, Any] = {"inflation_radius": 0.0, "recovery_behaviours_config": ""}
-LIST_NODE: Mapping[str, Any] = {"localise_by_topic": ""}
-"""What the list's reader takes of each item, less what depends on the map; it looks at no other key."""
 
 TRANSFORMATION = {
     "child": "topo_map",
@@ -125,6 +115,12 @@ class WriteOptions:
     pointset: str | None = parameter(
         None, "name of the network and its pointset; default: the source's, else the map's"
     )
+    fail_policy: str = parameter("fail", "what becomes of a failed edge, where its source names nothing")
+    fluid_navigation: bool = parameter(True, "whether new edges are driven without a stop at their end")
+    recovery: str = parameter("", "recovery_behaviours_config of edges that name none")
+    restrictions: str = parameter(ANYWHERE, "for planning and at run time, of nodes and edges that name none")
+    parent_frame: str = parameter(FRAME, "frame of nodes that name none")
+    localise_by_topic: str = parameter("", "of nodes that name none")
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +144,9 @@ class ListOptions:
     )
     osm: bool = parameter(False, "write OpenStreetMap's tags and attributes under properties of nodes and edges")
     pointset: str | None = parameter(None, "name of the pointset; default: the source's, else the map's")
+    inflation_radius: float = parameter(0.0, "of edges that name none", minimum=0.0, maximum=1000.0, unit="m")
+    recovery: str = parameter("", "recovery_behaviours_config of edges that name none")
+    localise_by_topic: str = parameter("", "of nodes that name none")
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
@@ -763,9 +762,14 @@ class _Writer:
             limit = (more or {}).get("speed_limit")
             speed = limit if isinstance(limit, (int, float)) and not isinstance(limit, bool) else self.options.top_vel
             fixed = {"map_2d": self.document["metric_map"], "top_vel": float(speed)}
-            out = {**LIST_EDGE, **fixed, **rest}
+            # What the list's reader takes of an edge; it looks at no other key.
+            fixed |= {
+                "inflation_radius": self.options.inflation_radius,
+                "recovery_behaviours_config": self.options.recovery,
+            }
+            out = {**fixed, **rest}
         else:
-            out = {**EDGE_TEMPLATE, "action_type": self.options.action_type, **rest} if fill else dict(rest)
+            out = {**EDGE_TEMPLATE, **self._usual_edge(self.options), **rest} if fill else dict(rest)
         if action is not None:
             out["action"] = action
         if fill or self.listed:
@@ -775,6 +779,28 @@ class _Writer:
         pieces = _split({**out, "edge_id": None, "node": None}, 6, "edge_id", "node")
         pieces[0] = f"    - {pieces[0][6:]}"
         return pieces
+
+    @staticmethod
+    def _usual_edge(options: WriteOptions) -> dict[str, Any]:
+        """What the options say of a new edge of a tmap2 file."""
+        return {
+            "action_type": options.action_type,
+            "fail_policy": options.fail_policy,
+            "fluid_navigation": options.fluid_navigation,
+            "recovery_behaviours_config": options.recovery,
+            "restrictions_planning": options.restrictions,
+            "restrictions_runtime": options.restrictions,
+        }
+
+    def _usual_node(self) -> dict[str, Any]:
+        """What the options say of a new node of a tmap2 file."""
+        assert isinstance(self.options, WriteOptions)
+        return {
+            "localise_by_topic": self.options.localise_by_topic,
+            "parent_frame": self.options.parent_frame,
+            "restrictions_planning": self.options.restrictions,
+            "restrictions_runtime": self.options.restrictions,
+        }
 
     def _node(self, p: Properties, name: str, said: str, at: tuple[str, str, str], edges: Lines) -> str:
         """The text of a node's entry. said: its name as YAML. at: its position as texts."""
@@ -835,15 +861,16 @@ class _Writer:
             own = _mapping_of(inner.get("properties"))
             tolerances = {key: own.get(key, value) for key, value in self._tolerances(known).items()}
             fixed = {"map": self.document["metric_map"], "pointset": self.document["pointset"]}
-            inner = {**LIST_NODE, "verts": self.ring, **fixed, **tolerances, **inner}
+            fixed |= {"localise_by_topic": self.options.localise_by_topic}
+            inner = {"verts": self.ring, **fixed, **tolerances, **inner}
         elif fill:
-            inner = {**NODE_TEMPLATE, "verts": self.ring, **inner}
+            inner = {**self._usual_node(), "verts": self.ring, **inner}
             tolerances = self._tolerances(known)
             # The older layout has its tolerances beside the name.
             tolerances = {key: inner.get(key, value) for key, value in tolerances.items()}
             inner["properties"] = {**tolerances, **_mapping_of(inner.get("properties"))}
         elif "nav_frame" not in inner:
-            inner.setdefault("parent_frame", "map")
+            inner.setdefault("parent_frame", FRAME)
         if more:
             inner["properties"] = {**_mapping_of(inner.get("properties")), **more}
         meta = {"map": self.document["metric_map"], "pointset": self.document["pointset"]}
@@ -859,23 +886,35 @@ class _Writer:
         return {key: value for key, value in p.items() if key not in canonical and key not in self.unwritten}
 
     def _report(self) -> None:
-        fill, filled = self.context.fill, self.filled
+        fill, filled, options = self.context.fill, self.filled, self.options
         if filled["edges"]:
             why = f"{filled['edges']} edges come from a format that does not say it"
-            fill("edges: action", self.options.action, f"{why}, where they name none")
-            if isinstance(self.options, ListOptions):
-                fill("edges: top_vel", self.options.top_vel, f"{why}, where they have no speed limit")
-                fill("edges: inflation_radius, map_2d, recovery_behaviours_config", "the usual ones", why)
+            where = f"{why}, where they name none"
+            fill("edges: action", options.action, where, "action")
+            if isinstance(options, ListOptions):
+                fill("edges: top_vel", options.top_vel, f"{why}, where they have no speed limit", "top_vel")
+                fill("edges: inflation_radius", options.inflation_radius, why, "inflation_radius")
+                fill("edges: map_2d", self.document["metric_map"], why)
             else:
-                said = "action_type, config, fail_policy, fluid_navigation, goal, restrictions"
-                fill(f"edges: {said}", "the usual ones", why)
+                fill("edges: action_type", options.action_type, where, "action_type")
+                fill("edges: fail_policy", options.fail_policy, why, "fail_policy")
+                fill("edges: fluid_navigation", options.fluid_navigation, why, "fluid_navigation")
+                fill("edges: restrictions", options.restrictions, why, "restrictions")
+                fill("edges: config, goal", "the usual ones", why)
+            fill("edges: recovery_behaviours_config", options.recovery, why, "recovery")
         if filled["nodes"]:
             why = f"{filled['nodes']} nodes come from a format that does not say it"
-            fill("nodes: verts", f"an octagon of {self.options.verts_radius:g} m", f"{why}, where they have none")
-            said = "map, pointset" if self.listed else "parent_frame, restrictions"
-            fill("nodes: xy_goal_tolerance", self.options.xy_goal_tolerance, f"{why}, where they have none")
-            fill("nodes: yaw_goal_tolerance", self.options.yaw_goal_tolerance, f"{why}, where they have an orientation")
-            fill(f"nodes: localise_by_topic, {said}", "the usual ones", why)
+            where = f"{why}, where they have none"
+            fill("nodes: verts", f"an octagon of {options.verts_radius:g} m", where, "verts_radius")
+            fill("nodes: xy_goal_tolerance", options.xy_goal_tolerance, where, "xy_goal_tolerance")
+            turned = f"{why}, where they have an orientation"
+            fill("nodes: yaw_goal_tolerance", options.yaw_goal_tolerance, turned, "yaw_goal_tolerance")
+            fill("nodes: localise_by_topic", options.localise_by_topic, why, "localise_by_topic")
+            if isinstance(options, WriteOptions):
+                fill("nodes: parent_frame", options.parent_frame, why, "parent_frame")
+                fill("nodes: restrictions", options.restrictions, why, "restrictions")
+            else:
+                fill("nodes: map, pointset", "the map's", why)
         if filled["orientations"]:
             fill("nodes: pose.orientation", [0.0, 0.0, 0.0, 1.0], f"{filled['orientations']} nodes have none")
         for what, count in sorted(self.dropped.items()):

@@ -8,5 +8,6 @@ from app.ingest.derivation import Wish
 from app.ingest.generation import Order
 from app.ingest.online import Provider
 from app.ingest.service import Ingest, Outcome, SpooledFile, Upload
+from app.ingest.templates import TemplateWish
 
-__all__ = ["Alignment", "Ingest", "Order", "Outcome", "Provider", "SpooledFile", "Upload", "Wish"]
+__all__ = ["Alignment", "Ingest", "Order", "Outcome", "Provider", "SpooledFile", "TemplateWish", "Upload", "Wish"]

@@ -85,7 +85,7 @@ def prepare_derivation(
         None,
         tuple(step.as_dict() for step in way),
         tuple(dict.fromkeys(text for k in sorted(used) for text in used[k].provenance.attribution)),
-        (*(_line(e) for k, e in sorted(used.items())), frame_line(base.datum, base.levels)),
+        (*(input_line(e) for k, e in sorted(used.items())), frame_line(base.datum, base.levels)),
     )
     operations = tuple(Replace(key, part, provenance) for key, part in sorted(fresh.items()))
     told = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
@@ -128,6 +128,7 @@ def _check_free(wish: Wish, keys: Any, own: Mapping[PartKey, PartEntry]) -> None
         )
 
 
-def _line(entry: PartEntry) -> dict[str, Any]:
+def input_line(entry: PartEntry) -> dict[str, Any]:
+    """A part as one of the inputs in a derived part's provenance."""
     key = entry.key
     return {"layer": key.layer, "level": key.level, "name": key.name, "hash": entry.hash}

@@ -441,13 +441,15 @@ def _trim(folder: Path, most: int) -> None:
 # --- in a worker ------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """What a provider sent, and what is to become of it. told: the step as the version's provenance says it."""
+    """What a provider sent, and what is to become of it. told: the step as the version's provenance says it. site: the
+    fences that it was fetched for, as the provenance's inputs."""
 
     sheet: Sheet
     answers: tuple[bytes | None, ...]
     chosen: Parameters
     told: Mapping[str, Any]
     attribution: tuple[str, ...]
+    site: tuple[Mapping[str, Any], ...] = ()
 
 
 def prepare_picture(
@@ -462,7 +464,8 @@ def prepare_picture(
     if missing:
         why = f"the provider has no picture for {missing} of {len(fetched.answers)} parts: they are transparent"
         warnings.append(Problem(why))
-    provenance = Provenance("derived", None, (), None, (dict(fetched.told),), fetched.attribution, ())
+    inputs = (*fetched.site, {"datum": base.datum.as_dict() if base.datum else None})
+    provenance = Provenance("derived", None, (), None, (dict(fetched.told),), fetched.attribution, inputs)
     store = open_store(database_url, blob_dir)
     return store.prepare(base, Changes((Replace(fetched.chosen.key, picture, provenance),))), tuple(warnings)
 

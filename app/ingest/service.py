@@ -18,11 +18,12 @@ from app.errors import CannotDerive, Conflict, Invalid, Problem, StaleParent, Un
 from app.formats import Limits
 from app.ingest import online
 from app.ingest.alignment import Aligned, Alignment, prepare_alignment, told_before
-from app.ingest.derivation import Wish, prepare_derivation
+from app.ingest.derivation import Wish, input_line, prepare_derivation
 from app.ingest.derivation import check as check_wish
 from app.ingest.edits import edit_changes
 from app.ingest.generation import Order, prepare_generation
 from app.ingest.prepare import Mode, Proposal, moved, prepare_changes, prepare_upload
+from app.ingest.templates import TemplateWish
 from app.model.frame import GROUND, Datum
 from app.model.layers import Layer
 from app.pool import WorkerDied
@@ -110,7 +111,8 @@ class Ingest:
                 sources = [
                     Source(f.name, f.size, f.sha256, notes[f.name].format, notes[f.name].used) for f in upload.files
                 ]
-                return Outcome("dry_run", None, self._preview(base, proposal, sources, author, upload.message))
+                p, told = proposal.prepared, proposal.warnings
+                return Outcome("dry_run", None, self._preview(base, p, told, sources, author, upload.message))
             sources = self._keep(upload, proposal)
             return self._commit(
                 environment, base, proposal.prepared, author, upload.message, sources, proposal.warnings, key
@@ -219,11 +221,13 @@ class Ingest:
 
         def once(base: Version) -> Outcome:
             online.check_free(base, chosen, replace=wish.replace)
-            site = self._store.load(base, sorted(e.key for e in base.parts if e.key.layer == "location" and e.count))
+            fences = sorted((e for e in base.parts if e.key.layer == "location" and e.count), key=lambda e: e.key)
+            site = self._store.load(base, [e.key for e in fences])
             sheet = online.sheet(provider, online.site_box(site, chosen), chosen.resolution)
             if not kept or kept[-1][0] != sheet:  # the same site again: what was fetched still holds
                 kept.append((sheet, tuple(online.Fetcher(provider).fetch(sheet.blocks))))
-            fetched = online.Fetched(sheet, kept[-1][1], chosen, provider.told(chosen), provider.attribution)
+            told, lines = provider.told(chosen), tuple(map(input_line, fences))
+            fetched = online.Fetched(sheet, kept[-1][1], chosen, told, provider.attribution, lines)
             prepared, warnings = self._in_worker(
                 online.prepare_picture, base, fetched, self._limits, what="the fetched picture could not be read"
             )
@@ -298,6 +302,31 @@ class Ingest:
             return self._commit(environment, base, prepared, author, text, (), moved(base, datum), None)
 
         return self._on_head(environment, None, if_match, once, "its datum can be set")
+
+    def template(
+        self,
+        environment: str,
+        wish: TemplateWish,
+        *,
+        message: str,
+        author: str,
+        if_match: str | None = None,
+        idempotency: str | None = None,
+    ) -> Outcome:
+        """What formats ask for and no layer has, said anew -> one version: robots get other maps by it.
+
+        wish: checked. Raises StaleParent, Conflict.
+        """
+        key = None if wish.dry_run else _idempotency(idempotency, _digest(["template", wish.as_dict(), message]))
+        text = message or wish.told()
+
+        def once(base: Version) -> Outcome:
+            prepared = self._store.prepare(base, Changes(templates=wish.applied(base.templates)))
+            if wish.dry_run:
+                return Outcome("dry_run", None, self._preview(base, prepared, (), (), author, text))
+            return self._commit(environment, base, prepared, author, text, (), (), key)
+
+        return self._on_head(environment, key, if_match, once, "its templates can be set")
 
     def _on_head(
         self,
@@ -390,10 +419,15 @@ class Ingest:
             raise UnreadableFile(f"{what}: {error.detail}") from error
 
     def _preview(
-        self, base: Version, proposal: Proposal, sources: Sequence[Source], author: str, message: str
+        self,
+        base: Version,
+        p: Prepared,
+        warnings: Sequence[Problem],
+        sources: Sequence[Source],
+        author: str,
+        message: str,
     ) -> dict[str, Any]:
-        """The version that an upload would make, without a number."""
-        p = proposal.prepared
+        """The version that a change would make, without a number."""
         preview = Version(
             environment=base.environment,
             number=base.number,
@@ -404,10 +438,11 @@ class Ingest:
             time=base.time,
             changes=p.changes,
             sources=tuple(sources),
-            warnings=proposal.warnings,
+            warnings=tuple(warnings),
             datum=p.datum,
             levels=p.levels,
             parts=p.parts,
+            templates=p.templates,
         )
         return {**preview.as_dict(), "version": None, "time": None}
 

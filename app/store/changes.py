@@ -10,6 +10,7 @@ from typing import Any, Final, Literal
 from app.model.features import Features
 from app.model.frame import Datum, Level
 from app.model.layers import Part, PartKey
+from app.model.templates import Templates
 from app.store.values import PartEntry, Provenance
 
 __all__ = [
@@ -78,11 +79,12 @@ Operation = Replace | Put | Delete | Drop
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """Operations in order, and the datum and levels where they are to change."""
+    """Operations in order, and the datum, levels and templates where they are to change."""
 
     operations: tuple[Operation, ...] = ()
     datum: Datum | Literal[Keep.KEEP] | None = KEEP
     levels: tuple[Level, ...] | Literal[Keep.KEEP] = KEEP
+    templates: Templates | Literal[Keep.KEEP] = KEEP
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +102,8 @@ class Prepared:
 
     chunks: hash (hex) -> stored bytes of all chunks that the base does not have. blobs: SHA-256 -> content of files
     that belong to the content (resources). changes: counts by layer. changed: whether the root differs from the
-    base's. index: the index' changes where they are few, else None (it is brought up to date when it is asked).
+    base's, or what says where the content comes from is renewed. index: the index' changes where they are few, else
+    None (it is brought up to date when it is asked).
     """
 
     base: int
@@ -109,6 +112,7 @@ class Prepared:
     parts: tuple[PartEntry, ...]
     datum: Datum | None
     levels: tuple[Level, ...]
+    templates: Templates
     changes: dict[str, Any]
     changed: bool
     blobs: Mapping[str, bytes] = field(default_factory=dict)

@@ -10,6 +10,7 @@ from app.model.features import Features
 from app.model.frame import Anchor
 from app.model.geodesy import local_frame
 from app.model.layers import VECTOR_LAYERS, Layers, PartKey
+from app.model.templates import template_changes
 from app.store import difference, parts
 from app.store.base import Base
 from app.store.parts import PartRoot
@@ -92,7 +93,7 @@ class Content(Base):
         Vector layers: ``{added: [ids], changed: [{id, fields}], deleted: [ids]}``, ids of all parts of the layer
         together. occupancy: ``{grid: {freed, blocked, unknown, other, bbox, fields?}}``, metres. voxels, imagery and
         resources: ``{name: {added, changed, deleted, fields?}}``, counts of voxels, tiles or files. ``datum`` and
-        ``levels``: ``{from, to}``.
+        ``levels``: ``{from, to}``; ``templates`` as ``template_changes`` says them.
         """
         draft = Draft(self._chunks)
         before, after = {e.key: e for e in a.parts}, {e.key: e for e in b.parts}
@@ -111,7 +112,8 @@ class Content(Base):
                 out.setdefault(key.layer, {})[names[key]] = difference.cells(draft, old, new).as_dict()
             else:
                 out.setdefault(key.layer, {})[names[key]] = difference.others(draft, old, new)
-        return out | frame_changes(a.datum, b.datum, a.levels, b.levels)
+        out |= frame_changes(a.datum, b.datum, a.levels, b.levels)
+        return out | template_changes(a.templates, b.templates)
 
     def delta_parts(self, a: Version, b: Version) -> Delta:
         """What turns version a into version b: features put and deleted, changed rectangles of grids."""

@@ -356,9 +356,19 @@ def _gather(v: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return out
 
 
-def root_hash(parts: Iterable[tuple[str, str, str, str]], datum: Datum | None, levels: Iterable[Level]) -> str:
-    """A version's root (hex) from (layer, level, name, hash in hex) of its parts, its datum and its levels."""
+def root_hash(
+    parts: Iterable[tuple[str, str, str, str]],
+    datum: Datum | None,
+    levels: Iterable[Level],
+    templates: Mapping[str, Any] | None = None,
+) -> str:
+    """A version's root (hex) from (layer, level, name, hash in hex) of its parts, its datum and its levels.
+
+    templates: what is filled in where no layer tells it, as ``Templates.as_dict`` says it; where there is none it has
+    no part in the hash.
+    """
     place = None if datum is None else [datum.latitude, datum.longitude, datum.altitude, datum.heading]
     storeys = sorted([level.name, level.elevation] for level in levels)
     named = [[layer, level, name, bytes.fromhex(h)] for layer, level, name, h in sorted(parts)]
-    return digest(pack([ENCODING, "version", named, place, storeys])).hex()
+    more = [templates] if templates else []
+    return digest(pack([ENCODING, "version", named, place, storeys, *more])).hex()

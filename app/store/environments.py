@@ -14,6 +14,7 @@ from sqlalchemy.exc import IntegrityError
 
 from app.errors import Conflict, Invalid
 from app.model.frame import Datum, Level
+from app.model.templates import NO_TEMPLATES, template_changes
 from app.store import outbox, tables
 from app.store.base import (
     Base,
@@ -88,6 +89,7 @@ class Environments(Base):
                 datum=None,
                 levels=(Level(),),
                 parts=(),
+                templates=NO_TEMPLATES,
                 changes={},
                 message="",
                 sequence=sequence,
@@ -109,6 +111,7 @@ class Environments(Base):
                     datum=first.datum,
                     levels=first.levels,
                     parts=first.parts,
+                    templates=first.templates,
                     changes=changes,
                     message=message,
                     sequence=sequence + 1,
@@ -135,6 +138,7 @@ class Environments(Base):
         if clone is not None:
             changes, _ = summarise(Draft(self._chunks), {}, {e.key: e for e in clone.parts})
         place = datum or (clone.datum if clone else None)
+        changes |= template_changes(NO_TEMPLATES, clone.templates if clone else NO_TEMPLATES)
         return changes | frame_changes(None, place, (Level(),), clone.levels if clone else (Level(),))
 
     def environment(self, name: str, *, deleted: bool = False) -> Environment:
@@ -308,7 +312,7 @@ def _first_version(
     made = Version(
         environment=row.name,
         number=1,
-        root=version_root(parts, place, levels),
+        root=version_root(parts, place, levels, base.templates),
         parent=0,
         author="",
         message=message,
@@ -319,6 +323,7 @@ def _first_version(
         datum=place,
         levels=levels,
         parts=parts,
+        templates=base.templates,
     )
     return made, message
 

@@ -11,6 +11,7 @@ from sqlalchemy import Connection, Row, select
 from app.errors import Damaged, NotFound, Problem
 from app.model.frame import Datum, Level
 from app.model.layers import PartKey
+from app.model.templates import NO_TEMPLATES, Templates
 from app.store import tables
 from app.store.encode import compress, decompress, pack
 from app.store.values import Box, PartEntry, Provenance, Source, Version
@@ -18,8 +19,13 @@ from app.store.values import Box, PartEntry, Provenance, Source, Version
 MANIFEST: Final = 1
 """The form of a version's manifest: [1, datum, levels, parts]; old forms stay readable by this number."""
 
+WITH_TEMPLATES: Final = 2
+"""The form of those that have templates: [2, datum, levels, parts, templates]."""
 
-def pack_manifest(datum: Datum | None, levels: Sequence[Level], parts: Sequence[PartEntry]) -> bytes:
+
+def pack_manifest(
+    datum: Datum | None, levels: Sequence[Level], parts: Sequence[PartEntry], templates: Templates = NO_TEMPLATES
+) -> bytes:
     """What a version holds, without the content itself."""
     rows = [
         [
@@ -36,18 +42,21 @@ def pack_manifest(datum: Datum | None, levels: Sequence[Level], parts: Sequence[
         for e in parts
     ]
     place = datum.as_dict() if datum else None
-    return compress(pack([MANIFEST, place, [[v.name, v.elevation] for v in levels], rows]))
+    storeys = [[v.name, v.elevation] for v in levels]
+    said = templates.as_dict()
+    return compress(pack([WITH_TEMPLATES, place, storeys, rows, said] if said else [MANIFEST, place, storeys, rows]))
 
 
 def _listed(box: Box | None) -> list[float] | None:
     return None if box is None else list(box)
 
 
-def unpack_manifest(data: bytes) -> tuple[Datum | None, tuple[Level, ...], tuple[PartEntry, ...]]:
+def unpack_manifest(data: bytes) -> tuple[Datum | None, tuple[Level, ...], tuple[PartEntry, ...], Templates]:
     """The reverse."""
-    form, place, levels, rows = ormsgpack.unpackb(decompress(data))
-    if form != MANIFEST:
+    form, *members = ormsgpack.unpackb(decompress(data))
+    if (form, len(members)) not in ((MANIFEST, 3), (WITH_TEMPLATES, 4)):
         raise Damaged("a version has a manifest that this release does not know: was it written by a newer one?")
+    place, levels, rows, *more = members
     parts = tuple(
         PartEntry(
             PartKey(layer, level, name),
@@ -59,12 +68,13 @@ def unpack_manifest(data: bytes) -> tuple[Datum | None, tuple[Level, ...], tuple
         )
         for layer, level, name, h, count, local, wgs84, digest, provenance in rows
     )
-    return (Datum(**place) if place else None), tuple(Level(n, e) for n, e in levels), parts
+    templates = Templates.from_dict(more[0]) if more else NO_TEMPLATES
+    return (Datum(**place) if place else None), tuple(Level(n, e) for n, e in levels), parts, templates
 
 
 def as_version(environment: str, row: Row[Any], sources: Sequence[Source]) -> Version:
     """A row and its sources as a value."""
-    datum, levels, parts = unpack_manifest(bytes(row.manifest))
+    datum, levels, parts, templates = unpack_manifest(bytes(row.manifest))
     return Version(
         environment=environment,
         number=row.number,
@@ -79,6 +89,7 @@ def as_version(environment: str, row: Row[Any], sources: Sequence[Source]) -> Ve
         datum=datum,
         levels=levels,
         parts=parts,
+        templates=templates,
     )
 
 

@@ -14,10 +14,11 @@ from app.model.frame import Datum, Level
 from app.model.geodesy import local_frame
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import LAYERS, PART_TYPES, VECTOR_LAYERS, PartKey
+from app.model.templates import NO_TEMPLATES, Templates, template_changes
 from app.store import difference, parts, tree
 from app.store.changes import KEEP, Changes, Delete, Drop, IndexRows, Operation, Prepared, Replace
 from app.store.difference import CellChanges, FeatureChanges
-from app.store.encode import bounds, compress, from_wkb, root_hash, to_wkb
+from app.store.encode import bounds, compress, from_wkb, pack, root_hash, to_wkb
 from app.store.parts import Item, Made, PartRoot
 from app.store.tree import Draft
 from app.store.values import PartEntry, Provenance, Version
@@ -46,13 +47,17 @@ def _prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
             replaced.pop(operation.key, None)
     datum = base.datum if changes.datum is KEEP else changes.datum
     levels = base.levels if changes.levels is KEEP else _check_levels(changes.levels)
+    templates = base.templates if changes.templates is KEEP else changes.templates
     listed = tuple(entries[key] for key in sorted(entries))
-    root = version_root(listed, datum, levels)
-    if root == base.root:
-        return Prepared(base.number, root, {}, base.parts, datum, levels, {}, changed=False)
+    root = version_root(listed, datum, levels, templates)
     before = {entry.key: entry for entry in base.parts}
+    renewed = _renewed(before, entries, replaced)
+    if root == base.root and not renewed:
+        return Prepared(base.number, root, {}, base.parts, datum, levels, templates, {}, changed=False)
     what, features = summarise(draft, before, entries, replaced)
     what |= frame_changes(base.datum, datum, base.levels, levels)
+    what |= template_changes(base.templates, templates)
+    what |= {"renewed": renewed} if renewed else {}
     index = None
     if datum == base.datum:
         index = index_rows(features, datum)
@@ -63,6 +68,7 @@ def _prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
         listed,
         datum,
         levels,
+        templates,
         what,
         changed=True,
         blobs=blobs,
@@ -70,9 +76,31 @@ def _prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
     )
 
 
-def version_root(entries: Sequence[PartEntry], datum: Datum | None, levels: Sequence[Level]) -> str:
+def version_root(
+    entries: Sequence[PartEntry], datum: Datum | None, levels: Sequence[Level], templates: Templates = NO_TEMPLATES
+) -> str:
     """The version's root hash."""
-    return root_hash(((e.key.layer, e.key.level, e.key.name, e.hash) for e in entries), datum, levels)
+    named = ((e.key.layer, e.key.level, e.key.name, e.hash) for e in entries)
+    return root_hash(named, datum, levels, templates.as_dict())
+
+
+def _renewed(
+    before: Mapping[PartKey, PartEntry], after: Mapping[PartKey, PartEntry], replaced: Mapping[PartKey, Replace]
+) -> list[dict[str, str]]:
+    """The derived parts whose content was given anew and is the same, by another way or from other inputs than before.
+
+    What they say of themselves then needs a version of its own, since it decides on whether they are stale.
+    """
+    out = []
+    for key in sorted(replaced):
+        a, b = before.get(key), after.get(key)
+        if a is None or b is None or a.hash != b.hash or a.provenance.information != "derived" or b.provenance.edited:
+            continue
+        # Packed, since what is stored has lists where a step just made may have tuples.
+        old, new = (pack([p.information, list(p.steps), list(p.inputs)]) for p in (a.provenance, b.provenance))
+        if old != new:
+            out.append({"layer": key.layer, "level": key.level, "name": key.name})
+    return out
 
 
 def _check_levels(levels: Sequence[Level]) -> tuple[Level, ...]:

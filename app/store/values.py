@@ -14,6 +14,7 @@ from app.errors import Problem
 from app.model.features import Features
 from app.model.frame import Datum, Level
 from app.model.layers import LAYERS, Layer, PartKey
+from app.model.templates import NO_TEMPLATES, Templates
 
 EDIT = "edit"
 """The step that people's changes leave in the provenance of what was derived."""
@@ -160,7 +161,8 @@ class Version:
     """An immutable state of an environment.
 
     environment: its name. changes: counts of what this version changed against its parent, by layer. warnings: what
-    was doubtful in its sources. parts: sorted by key.
+    was doubtful in its sources. parts: sorted by key. templates: what is filled in where a format asks for more than
+    the layers have.
     """
 
     environment: str
@@ -176,6 +178,7 @@ class Version:
     datum: Datum | None
     levels: tuple[Level, ...]
     parts: tuple[PartEntry, ...]
+    templates: Templates = NO_TEMPLATES
 
     def part(self, key: PartKey) -> PartEntry | None:
         """The entry of a part, or None."""
@@ -190,15 +193,19 @@ class Version:
             changed = []
             for line in entry.provenance.inputs:
                 if "layer" not in line:
-                    if line != frame_line(self.datum, self.levels):
-                        changed.append("datum or levels")
+                    frame = frame_line(self.datum, self.levels)
+                    if line != {name: frame.get(name) for name in line}:
+                        changed.append("datum or levels" if "levels" in line else "datum")
                 elif now.get((line["layer"], line["level"], line["name"])) != line["hash"]:
                     changed.append(f"{line['layer']} {line['level']}/{line['name']}")
             used = {(n["layer"], n["level"], n["name"]) for n in entry.provenance.inputs if "layer" in n}
             layers = {layer for layer, _, _ in used}
-            layers |= {layer for step in entry.provenance.steps for layer in step.get("also", ())}
+            steps = entry.provenance.steps
+            layers |= {layer for step in steps for layer in step.get("also", ())}
+            if any("location" in step.get("from", ()) for step in steps):
+                layers.add("location")  # the one layer that a step may have done without: a datum is location enough
             own = (entry.key.layer, entry.key.level, entry.key.name)
-            new = [k for k in now if k[0] in layers and k not in used and k != own] if used else []
+            new = [k for k in now if k[0] in layers and k not in used and k != own] if entry.provenance.inputs else []
             changed += [f"{layer} {level}/{name}" for layer, level, name in new]
             if changed:
                 out[entry.key] = tuple(changed)

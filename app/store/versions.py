@@ -11,6 +11,7 @@ from sqlalchemy import Connection, Row, func, insert, select, update
 
 from app.errors import Conflict, Invalid, NotFound, Problem, StaleParent, Unavailable
 from app.model.frame import Datum, Level
+from app.model.templates import Templates, template_changes
 from app.store import chunks, index, outbox, tables
 from app.store.base import Base, clean, clean_problem, environment_row, text, utcnow
 from app.store.changes import Changes, Prepared
@@ -51,6 +52,7 @@ def insert_version(
     datum: Datum | None,
     levels: Sequence[Level],
     parts: Sequence[PartEntry],
+    templates: Templates,
     changes: Mapping[str, Any],
     sources: Sequence[Source],
     warnings: Sequence[Problem],
@@ -73,7 +75,7 @@ def insert_version(
             sequence=sequence,
             changes=dict(changes),
             warnings=[clean_problem(w).as_dict() for w in warnings],
-            manifest=pack_manifest(datum, levels, parts),
+            manifest=pack_manifest(datum, levels, parts, templates),
         )
     )
     insert_sources(connection, environment.id, number, sources, first=0)
@@ -212,6 +214,7 @@ class Versions(Base):
                 datum=prepared.datum,
                 levels=prepared.levels,
                 parts=prepared.parts,
+                templates=prepared.templates,
                 changes=prepared.changes,
                 sources=sources,
                 warnings=warnings,
@@ -288,9 +291,9 @@ class Versions(Base):
             before, after = {e.key: e for e in head.parts}, {e.key: e for e in target.parts}
             changes, _ = summarise(Draft(self._chunks), before, after)
             changes |= frame_changes(head.datum, target.datum, head.levels, target.levels)
-        return Prepared(
-            head.number, target.root, {}, target.parts, target.datum, target.levels, changes, changed=changed
-        )
+            changes |= template_changes(head.templates, target.templates)
+        kept = (target.parts, target.datum, target.levels, target.templates)
+        return Prepared(head.number, target.root, {}, *kept, changes, changed=changed)
 
     def idempotent(self, environment: str, key: str) -> tuple[str, int] | None:
         """(fingerprint, version number) of the request that used this key, or None."""

@@ -74,6 +74,22 @@ def test_what_it_was_made_from_changes_and_maps_follow(api: Api, env: str) -> No
     assert nodes(api, env) == 3
 
 
+def test_what_comes_out_the_same_is_no_longer_stale(api: Api, env: str) -> None:
+    derive(api, env, parameters={"join": 0.5})
+    named = {"lanes.kml": lanes()["lanes.kml"].replace(b"<name>lanes", b"<name>ways")}
+    api.upload(env, named)
+    stale = api.get(f"environments/{env}/versions/latest").json()
+    assert [s["changed"] for s in stale["stale"]] == [["objects ground/kml"]]
+    made = derive(api, env, parameters={"join": 0.5})
+    assert (made["version"], made["root"], made["stale"]) == (5, stale["root"], [])
+    assert made["changes"] == {"renewed": [{"layer": "topology", "level": "ground", "name": "network"}]}
+    report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
+    assert not any("derive it anew" in w["problem"] for w in report["warnings"])
+    assert api.get(f"environments/{env}/diff?from=4&to=5").json()["layers"] == {}
+    assert derive(api, env, expect=200, parameters={"join": 0.5})["version"] == 5, "and now nothing is new"
+    assert api.get(f"environments/{env}/versions/4").json()["stale"] == stale["stale"], "history stays"
+
+
 def test_what_people_have_edited_is_not_thrown_away(api: Api, env: str) -> None:
     derive(api, env)
     point = {"type": "Point", "coordinates": [0.003, 0.003]}

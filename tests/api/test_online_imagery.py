@@ -31,6 +31,8 @@ from tests.api.conftest import Api, running, settings_for
 FENCE = """<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>fence</name><Polygon><outerBoundaryIs>
 <LinearRing><coordinates>-0.5251,53.2682 -0.5240,53.2682 -0.5240,53.2688 -0.5251,53.2688 -0.5251,53.2682</coordinates>
 </LinearRing></outerBoundaryIs></Polygon></Placemark></Document></kml>"""
+FEATURE = {"type": "Feature", "id": "post", "geometry": None, "properties": {"kind": "pole"}}
+FEATURE |= {"place": {"type": "Point", "coordinates": [1.0, 1.0]}}
 BOX = (-0.5251, 53.2682, -0.5240, 53.2688)
 
 
@@ -395,9 +397,26 @@ def test_a_site_gets_its_picture(provider: Misbehaving, tmp_path: Path) -> None:
         assert SECRET not in str(report) + str(made) + str(told)
         assert api.get("/maps/farm/satellite").content[:4] in (b"II*\0", b"MM\0*")
         assert api.post(path, wish, expect=200).json()["version"] == made["version"], "the same picture"
-        # The fence moves: the picture stays, and stays served.
-        api.upload("farm", {"fence.kml": FENCE.replace("-0.5240", "-0.5242").encode()}, layer="location")
+        # Another storey has nothing to do with it.
+        put = {"op": "put", "layer": "objects", "level": "1", "feature": FEATURE}
+        assert api.post("environments/farm/edits", {"changes": [put]}).json()["stale"] == []
+        # The fence moves: the picture is stale, and stays served until it is fetched anew.
+        (fence,) = api.get("environments/farm/versions/latest/layers/location").json()["features"]
+        fence["geometry"]["coordinates"][0][1][0] = fence["geometry"]["coordinates"][0][2][0] = -0.5242
+        put = {"op": "put", "layer": "location", "feature": fence}
+        (stale,) = api.post("environments/farm/edits", {"changes": [put]}).json()["stale"]
+        assert (stale["layer"], stale["changed"]) == ("imagery", ["location ground/site"])
         assert api.get("/maps/farm/satellite").status_code == 200
+        report = api.get("environments/farm/versions/latest/reports/satellite").json()
+        assert any("derive it anew" in w["problem"] for w in report["warnings"])
+        assert api.post(path, wish).json()["stale"] == []
+        # So does the datum; what comes is the same, and no longer stale.
+        place = {"latitude": 53.2682, "longitude": -0.5251, "altitude": 20.0}
+        api("PATCH", "environments/farm", 200, json={"datum": place})
+        later = api.get("environments/farm/versions/latest").json()
+        assert [s["changed"] for s in later["stale"]] == [["datum"]]
+        again = api.post(path, wish).json()
+        assert (again["version"], again["root"], again["stale"]) == (later["version"] + 1, later["root"], [])
         # What a provider does wrong makes no version.
         for mood, status in (("broken", 503), ("html", 422), ("forbidden", 422), ("bomb", 422)):
             provider.mood = mood
@@ -409,6 +428,15 @@ def test_a_site_gets_its_picture(provider: Misbehaving, tmp_path: Path) -> None:
         viewer = api.token_for("viewer")
         viewer.problem("POST", path, 403, json=wish)
         assert api.get("environments/farm/versions/latest").json()["version"] == before
+
+
+def test_a_picture_around_the_datum_is_stale_when_there_is_a_fence(provider: Misbehaving, tmp_path: Path) -> None:
+    with serving(tmp_path, provider) as api:
+        api.post("environments", {"name": "farm", "datum": {"latitude": 53.2682, "longitude": -0.5251}})
+        wish = {"method": "location_to_imagery", "parameters": {"resolution": 0.5, "radius": 20}}
+        assert api.post("environments/farm/derivations", wish).json()["stale"] == []
+        later = api.upload("farm", {"fence.kml": FENCE.encode()}, layer="location").json()
+        assert [s["changed"] for s in later["stale"]] == [["location ground/site"]]
 
 
 def test_without_a_provider_nobody_is_asked(api: Api, fresh: Callable[[], str]) -> None:

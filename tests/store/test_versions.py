@@ -18,6 +18,7 @@ from app.errors import Conflict, Invalid, NotFound, Problem, StaleParent, Unavai
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.layers import Layers, Part, PartKey, Resources
+from app.model.templates import NO_TEMPLATES, Own, Templates
 from app.model.voxels import VoxelMap
 from app.store import Store
 from app.store.changes import Changes, Delete, Drop, Put, Replace
@@ -651,3 +652,84 @@ def test_a_chunk_that_is_used_again_is_kept(farm: Store):
     farm.delete_environment("other")
     farm.purge_environment("other")
     assert farm.collect(timedelta(hours=1))["chunks"] == 0
+
+
+# --- templates ---
+
+OUTDOOR = Templates("outdoor", {"tmap2": Own(None, {"xy_goal_tolerance": 0.4}), "lif": Own("default")})
+
+
+def say(store: Store, templates: Templates, env: str = "farm") -> Any:
+    prepared = store.prepare(store.version(env), Changes(templates=templates))
+    return store.commit(env, prepared, author="a", message="templates")
+
+
+def test_templates_are_part_of_a_version(farm: Store):
+    before = save(farm, "farm", *replaces(everything()))
+    assert before.templates == NO_TEMPLATES
+    made = say(farm, OUTDOOR)
+    assert (made.number, made.parts) == (before.number + 1, before.parts)
+    assert made.root != before.root
+    assert made.changes.keys() == {"templates"}
+    assert farm.version("farm").templates == OUTDOOR
+    assert farm.version("farm", before.number).templates == NO_TEMPLATES
+    assert farm.diff(before, made) == made.changes
+    assert say(farm, OUTDOOR).number == made.number, "nothing new"
+    event = farm.events("farm", since=0)[-1]
+    assert (event.body["version"], event.body["layers"]) == (made.number, [])
+    later = save(farm, "farm", Drop(GRID))
+    assert later.templates == OUTDOOR, "other changes leave them"
+    moved = farm.commit("farm", farm.prepare(later, Changes(datum=None)), author="a", message="")
+    assert moved.templates == OUTDOOR
+    back = farm.revert("farm", before.number, author="a", message="")
+    assert (back.root, back.templates) == (before.root, NO_TEMPLATES)
+    assert back.changes["templates"]["set"] == {"from": "outdoor", "to": "default"}
+    farm.create_environment("copy", clone=made)
+    copied = farm.version("copy")
+    assert (copied.root, copied.templates) == (made.root, OUTDOOR)
+    assert copied.changes["templates"]["set"] == {"from": "default", "to": "outdoor"}
+    farm.collect(timedelta(0))
+    assert farm.version("farm", made.number).templates == OUTDOOR
+
+
+def test_templates_count_for_roots_alike_on_both_databases(store: Store, sqlite_store: Store):
+    roots = []
+    for one in (store, sqlite_store):
+        one.create_environment("farm", datum=DATUM)
+        bare = one.version("farm").root
+        roots.append((bare, say(one, OUTDOOR).root, say(one, Templates()).root))
+    assert roots[0] == roots[1]
+    assert roots[0][0] == roots[0][2] != roots[0][1]
+
+
+# --- provenance that is renewed ---
+
+
+def derived(hash_: str, join: float = 1.0) -> Provenance:
+    inputs = ({"layer": "objects", "level": "ground", "name": "kml", "hash": hash_},)
+    return Provenance("derived", steps=({"step": "objects_to_topology", "parameters": {"join": join}},), inputs=inputs)
+
+
+def test_what_is_derived_anew_from_other_inputs_is_a_version_though_it_is_the_same(farm: Store):
+    first = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("a")))
+    again = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("a")))
+    assert again.number == first.number, "the same again"
+    new = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("b")))
+    assert (new.number, new.root) == (first.number + 1, first.root)
+    assert new.changes["renewed"] == [{"layer": "topology", "level": "ground", "name": TOPOLOGY.name}]
+    assert new.part(TOPOLOGY).provenance.inputs[0]["hash"] == "b"  # type: ignore[union-attr]
+    assert farm.version("farm", first.number).part(TOPOLOGY).provenance.inputs[0]["hash"] == "a"  # type: ignore[union-attr]
+    assert farm.diff(first, new) == {}
+    other = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("b", 2.0)))
+    assert other.number == new.number + 1, "by another way"
+    told = save(farm, "farm", Replace(TOPOLOGY, network(3), Provenance(sources=("n.yaml",))))
+    assert (told.number, told.information["topology"]) == (other.number + 1, "raw"), "a source says it now"
+    same = save(farm, "farm", Replace(TOPOLOGY, network(3), Provenance(sources=("m.yaml",))))
+    assert same.number == told.number, "of two sources that say the same the first one stays"
+
+
+def test_an_edit_that_changes_nothing_renews_nothing(farm: Store):
+    first = save(farm, "farm", Replace(TOPOLOGY, network(3), derived("a")))
+    assert save(farm, "farm", Put(TOPOLOGY, network(3).take([0]))).number == first.number
+    edited = derived("a").marked()
+    assert save(farm, "farm", Replace(TOPOLOGY, network(3), edited)).number == first.number

@@ -1,0 +1,193 @@
+"""Templates: what formats ask for and no layer has, by named sets and for each environment."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query
+from starlette.responses import Response
+
+from app import formats, templates
+from app.api.access import Editor, Principal, Viewer
+from app.api.answers import Route, answer
+from app.api.maps import number_of
+from app.api.schemas import (
+    MAX_TEXT,
+    VERSION,
+    EnvironmentPath,
+    FormatTemplatesBody,
+    FormatTemplatesOut,
+    IdempotencyKey,
+    IfMatch,
+    TemplatesBody,
+    TemplateSetOut,
+    TemplatesOut,
+    VersionOut,
+    told,
+)
+from app.api.services import Here, Services
+from app.api.versions import told_as
+from app.formats import Format
+from app.ingest import TemplateWish
+from app.model.templates import Own, Templates
+from app.store.values import Version
+
+router = APIRouter(tags=["templates"], route_class=Route)
+
+FormatPath = Annotated[
+    str, Path(max_length=64, description="A format's id; see `GET /api/v1/formats`.", examples=["tmap2"])
+]
+Which = Annotated[
+    str, Query(alias="version", pattern=VERSION, description="Number, channel, or `latest`.", examples=["latest"])
+]
+Message = Annotated[str, Query(max_length=MAX_TEXT, description="Why, for the history.")]
+DryRun = Annotated[bool, Query(description="Only say what would be.")]
+
+CHANGED: dict[int | str, dict[str, Any]] = {
+    **told(VersionOut, 400, 404, 409, 412, 415, ok=201, description="A new version"),
+    200: {"model": VersionOut, "description": "Nothing changed: the head. Or a dry run: `version` is null."},
+}
+
+
+@router.get("/templates", responses=told(list[TemplateSetOut]), summary="All template sets")
+def list_sets(_: Viewer) -> Response:
+    """Named sets of values for parameters of formats. What one does not say is left to the format's defaults."""
+    return answer(sets())
+
+
+def sets() -> list[dict[str, Any]]:
+    """The named sets as clients see them."""
+    return [one.as_dict(name) for name, one in templates.SETS.items()]
+
+
+@router.get("/environments/{env}/templates", responses=told(TemplatesOut, 404), summary="An environment's templates")
+def get_templates(env: EnvironmentPath, here: Here, _: Viewer, version: Which = "latest") -> Response:
+    """The chosen set, and for each format with parameters the values of its own, what holds, and from where.
+
+    A parameter of a request goes before the environment's values, these before the set's, these before the format's
+    defaults.
+    """
+    found = here.store.version(env, number_of(version))
+    known = [f for f in formats.all_formats().values() if f.write is not None and templates.has_parameters(f)]
+    body = {
+        "environment": env,
+        "version": found.number,
+        "set": found.templates.set,
+        "sets": list(templates.SETS),
+        "formats": [_line(found.templates, one) for one in known],
+    }
+    return answer(body, headers=_headers(found))
+
+
+@router.put("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Choose a template set")
+def put_templates(
+    env: EnvironmentPath,
+    body: TemplatesBody,
+    here: Here,
+    who: Editor,
+    if_match: IfMatch = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """A version in which another set holds, or other values of several formats at once. What is left out stays."""
+    own = {name: Own(said.set, said.values) for name, said in body.formats.items()}
+    wish = TemplateWish(body.set, own, dry_run=body.dry_run).checked()
+    return _said(here, env, wish, body.message, who, if_match, idempotency_key)
+
+
+@router.delete("/environments/{env}/templates", status_code=201, responses=CHANGED, summary="Take all templates back")
+def delete_templates(
+    env: EnvironmentPath,
+    here: Here,
+    who: Editor,
+    message: Message = "",
+    dry_run: DryRun = False,
+    if_match: IfMatch = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """A version in which the formats' own defaults hold."""
+    wish = TemplateWish(clear=True, dry_run=dry_run)
+    return _said(here, env, wish, message, who, if_match, idempotency_key)
+
+
+@router.get(
+    "/environments/{env}/templates/{format}",
+    responses=told(FormatTemplatesOut, 404),
+    summary="An environment's templates for a format",
+)
+def get_format_templates(
+    env: EnvironmentPath, format: FormatPath, here: Here, _: Viewer, version: Which = "latest"
+) -> Response:
+    """`values`: the environment's own. `effective`: each parameter's value, and `from`: `environment`, `set NAME` or
+    `default`."""
+    known = templates.check_format(format)
+    found = here.store.version(env, number_of(version))
+    body = {"environment": env, "version": found.number, **_line(found.templates, known)}
+    return answer(body, headers=_headers(found))
+
+
+@router.put(
+    "/environments/{env}/templates/{format}",
+    status_code=201,
+    responses=CHANGED,
+    summary="Set an environment's templates for a format",
+)
+def put_format_templates(
+    env: EnvironmentPath,
+    format: FormatPath,
+    body: FormatTemplatesBody,
+    here: Here,
+    who: Editor,
+    if_match: IfMatch = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """A version with these values of the format's parameters, instead of all that was said of the format before.
+
+    Maps of the new version are made with them; old versions keep answering as they did.
+    """
+    wish = TemplateWish(None, {format: Own(body.set, body.values)}, dry_run=body.dry_run).checked("body")
+    return _said(here, env, wish, body.message, who, if_match, idempotency_key)
+
+
+@router.delete(
+    "/environments/{env}/templates/{format}",
+    status_code=201,
+    responses=CHANGED,
+    summary="Take an environment's templates for a format back",
+)
+def delete_format_templates(
+    env: EnvironmentPath,
+    format: FormatPath,
+    here: Here,
+    who: Editor,
+    message: Message = "",
+    dry_run: DryRun = False,
+    if_match: IfMatch = None,
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """A version in which the environment's set holds for the format again."""
+    wish = TemplateWish(None, {format: Own()}, dry_run=dry_run).checked()
+    return _said(here, env, wish, message, who, if_match, idempotency_key)
+
+
+def _said(
+    here: Services, env: str, wish: TemplateWish, message: str, who: Principal, if_match: str | None, key: str | None
+) -> Response:
+    outcome = here.ingest.template(env, wish, message=message, author=who.name, if_match=if_match, idempotency=key)
+    return told_as(outcome)
+
+
+def _line(said: Templates, known: Format) -> dict[str, Any]:
+    """One format's templates as clients see them."""
+    own, ignored = said.of(known.name), templates.resolve(said, known).ignored
+    return {
+        "format": known.name,
+        "set": own.set,
+        "values": dict(own.values),
+        "effective": templates.effective(said, known),
+        **({"ignored": list(ignored)} if ignored else {}),
+    }
+
+
+def _headers(version: Version) -> dict[str, str]:
+    number = str(version.number)
+    return {"etag": f'"{number}"', "fleetmap-version": number, "fleetmap-root": version.root}

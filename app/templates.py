@@ -1,0 +1,174 @@
+"""What formats ask for and no layer has: named sets of values, and what holds for an environment.
+
+A set gives values to the writers' own parameters, by format; a new one is one entry of ``SETS``. What is asked for
+with a request goes before what the environment says (``app.model.templates``), this before its set, and this before
+the format's defaults.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from app import formats, parameters
+from app.errors import Invalid, NotFound, Problem
+from app.formats import Format
+from app.model.templates import DEFAULT_SET, Own, Templates
+
+REQUEST, ENVIRONMENT, DEFAULT = "request", "environment", "default"
+"""Where a value may come from, besides a set."""
+
+LONGEST_TEXT: Final = 2000
+"""Characters of a text among the values."""
+
+
+@dataclass(frozen=True, slots=True)
+class Set:
+    """A named set. values: by format, by parameter of its writer."""
+
+    title: str
+    values: Mapping[str, Mapping[str, Any]]
+
+    def as_dict(self, name: str) -> dict[str, Any]:
+        """The set as clients see it."""
+        values = {known: dict(sorted(said.items())) for known, said in sorted(self.values.items())}
+        return {"name": name, "title": self.title, "formats": values}
+
+
+_GOALS = {"action": "NavigateToPose", "action_type": "geometry_msgs/PoseStamped"}
+
+SETS: Final[Mapping[str, Set]] = {
+    DEFAULT_SET: Set("Each format's own defaults", {}),
+    "outdoor": Set(
+        "Fields, orchards and yards: wide goals, grass underfoot, low walls",
+        {
+            "tmap2": {"verts_radius": 1.5, "xy_goal_tolerance": 0.5, "yaw_goal_tolerance": 0.3},
+            "tmap": {"verts_radius": 1.5, "xy_goal_tolerance": 0.5, "yaw_goal_tolerance": 0.3, "top_vel": 1.0},
+            "gazebo": {"wall_height": 1.5},
+            "lanelet2": {"width": 3.0, "location": "nonurban"},
+        },
+    ),
+    "indoor": Set(
+        "Offices and wards: narrow goals, slow robots, rooms as high as usual",
+        {
+            "tmap2": {"verts_radius": 0.5, "xy_goal_tolerance": 0.2},
+            "tmap": {"verts_radius": 0.5, "xy_goal_tolerance": 0.2, "top_vel": 0.5},
+            "gazebo": {"wall_height": 2.7, "building_height": 3.0},
+            "lanelet2": {"width": 1.2, "subtype": "walkway"},
+        },
+    ),
+    "warehouse": Set(
+        "Halls with shelves and docks: exact goals, high walls",
+        {
+            "tmap2": {"xy_goal_tolerance": 0.1, "yaw_goal_tolerance": 0.05},
+            "tmap": {"xy_goal_tolerance": 0.1, "yaw_goal_tolerance": 0.05, "top_vel": 1.5},
+            "gazebo": {"wall_height": 6.0, "building_height": 8.0},
+            "lanelet2": {"width": 2.0},
+            "lif": {"vehicle_type": "forklift"},
+        },
+    ),
+    "ros2": Set(
+        "Robots whose topological_navigation and route server run on ROS 2",
+        {"tmap2": dict(_GOALS), "tmap": {"action": _GOALS["action"]}},
+    ),
+}
+"""All sets by name. What one does not say is left to the format's defaults."""
+
+
+@dataclass(frozen=True, slots=True)
+class Resolved:
+    """What holds for one format of an environment. values: of the set and the environment. origin: where each came
+    from: ``environment`` or ``set NAME``. ignored: what was kept once and cannot be used any more."""
+
+    values: Mapping[str, Any] = field(default_factory=dict)
+    origin: Mapping[str, str] = field(default_factory=dict)
+    ignored: tuple[str, ...] = ()
+
+
+NOTHING: Final = Resolved()
+
+
+def check_set(name: str, where: str = "set") -> str:
+    """Invalid, with the known ones, where there is no such set."""
+    if name not in SETS:
+        reason = f"there is no template set {name[:80]!r}; known sets: {', '.join(SETS)}"
+        raise Invalid(reason, [Problem(reason, where=where)])
+    return name
+
+
+def check_format(name: str) -> Format:
+    """The format; NotFound where there is none, or it is not served."""
+    known = formats.get_format(name)
+    if known.write is None:
+        raise NotFound(f"{name} is read and not served: it has no templates")
+    return known
+
+
+def check_values(known: Format, values: Mapping[str, Any], where: str = "values") -> dict[str, Any]:
+    """Values of a format's parameters, typed, as JSON has them; Invalid names each that is unknown or wrong."""
+    try:
+        chosen = parameters.parse(known.write_options, values, f"parameter of {known.name}")
+    except Invalid as error:
+        raise Invalid(
+            error.detail, [dataclasses.replace(p, where=f"{where}.{p.where}") for p in error.problems]
+        ) from None
+    out = {name: _plain(getattr(chosen, name)) for name in sorted(values)}
+    reason = f"a text has at most {LONGEST_TEXT} printable characters"
+    texts = {name: value for name, value in out.items() if isinstance(value, str)}
+    bad = [n for n, text in texts.items() if len(text) > LONGEST_TEXT or not text.isprintable()]
+    if bad:
+        raise Invalid(reason, [Problem(reason, where=f"{where}.{name}") for name in bad])
+    return out
+
+
+def resolve(templates: Templates, known: Format) -> Resolved:
+    """The values that an environment's templates give to a format.
+
+    What an older or newer release has kept and this one does not know is left out, and told in ``ignored``: a robot
+    gets its map all the same.
+    """
+    if templates.set == DEFAULT_SET and not templates.formats:
+        return NOTHING
+    own, chosen = templates.of(known.name), templates.chosen(known.name)
+    ignored = [] if chosen in SETS else [f"the template set {chosen!r} is not known to this release"]
+    values: dict[str, Any] = {}
+    origin: dict[str, str] = {}
+    of_set = SETS[chosen].values.get(known.name, {}) if chosen in SETS else {}
+    for source, said in ((f"set {chosen}", of_set), (ENVIRONMENT, own.values)):
+        for name, value in said.items():
+            try:
+                check_values(known, {name: value})
+            except Invalid as error:
+                ignored.append(f"{known.name}: {error.detail}")
+                continue
+            values[name], origin[name] = value, source
+    return Resolved(values, origin, tuple(ignored))
+
+
+def effective(templates: Templates, known: Format) -> dict[str, dict[str, Any]]:
+    """``{PARAMETER: {value, from}}`` of all parameters of a format's writer."""
+    found = resolve(templates, known)
+    return {
+        p["name"]: {
+            "value": _plain(found.values.get(p["name"], p["default"])),
+            "from": found.origin.get(p["name"], DEFAULT),
+        }
+        for p in parameters.describe(known.write_options)
+    }
+
+
+def has_parameters(known: Format) -> bool:
+    """Whether there is anything that a template could say of a format."""
+    return bool(dataclasses.fields(known.write_options))
+
+
+def with_own(templates: Templates, name: str, own: Own) -> Templates:
+    """The same with something else said of one format; nothing is said of it where ``own`` is empty."""
+    others = {known: said for known, said in templates.formats.items() if known != name}
+    return Templates(templates.set, {**others, name: own} if own.as_dict() else others)
+
+
+def _plain(value: Any) -> Any:
+    return list(map(_plain, value)) if isinstance(value, tuple) else value

@@ -1,0 +1,77 @@
+"""The named sets hold what writers accept; what holds for a format follows from set and environment."""
+
+from __future__ import annotations
+
+import pytest
+
+from app import formats, parameters, templates
+from app.errors import Invalid
+from app.model.templates import NO_TEMPLATES, Own, Templates, template_changes
+
+TMAP2 = formats.get_format("tmap2")
+
+
+@pytest.mark.parametrize("name", templates.SETS)
+def test_every_set_says_what_writers_take(name: str) -> None:
+    one = templates.SETS[name]
+    assert one.title
+    for known, values in one.values.items():
+        assert values, known
+        checked = templates.check_values(formats.get_format(known), values)
+        assert checked == dict(sorted(values.items())), f"{known}: values stand as they are kept"
+        defaults = {p["name"]: p["default"] for p in parameters.describe(formats.get_format(known).write_options)}
+        same = [key for key, value in checked.items() if value == defaults[key]]
+        assert not same, f"{known}: {same} say the format's own defaults"
+
+
+def test_no_name_stands_for_two_things() -> None:
+    """``set`` stands beside formats' names and parameters' names in a version's changes."""
+    assert "set" not in formats.all_formats()
+    for known in formats.all_formats().values():
+        assert "set" not in {p["name"] for p in parameters.describe(known.write_options)}
+
+
+def test_what_holds() -> None:
+    assert templates.resolve(NO_TEMPLATES, TMAP2) is templates.NOTHING
+    said = Templates("outdoor", {"tmap2": Own(None, {"xy_goal_tolerance": 0.4}), "lif": Own(None, {"creator": "x"})})
+    found = templates.resolve(said, TMAP2)
+    assert found.values["xy_goal_tolerance"] == 0.4
+    assert found.origin["xy_goal_tolerance"] == templates.ENVIRONMENT
+    assert found.origin["verts_radius"] == "set outdoor"
+    assert "action" not in found.values
+    assert found.ignored == ()
+    own = templates.with_own(said, "tmap2", Own("default"))
+    assert templates.resolve(own, TMAP2).values == {}, "the default set on purpose"
+    assert templates.with_own(own, "tmap2", Own()).formats.keys() == {"lif"}
+    assert Templates.from_dict(said.as_dict()) == said
+    assert Templates.from_dict({}) == NO_TEMPLATES
+    assert Templates("default", {"tmap2": Own()}) == NO_TEMPLATES
+    assert hash(Templates("default", {"tmap2": Own()})) == hash(NO_TEMPLATES)
+    assert Templates("indoor") != NO_TEMPLATES
+
+
+def test_what_differs() -> None:
+    a = Templates("default", {"tmap2": Own(None, {"action": "go", "osm": False})})
+    b = Templates("indoor", {"tmap2": Own("ros2", {"action": "run", "osm": False}), "lif": Own(None, {"creator": "x"})})
+    assert template_changes(a, a) == {}
+    assert template_changes(a, b) == {
+        "templates": {
+            "set": {"from": "default", "to": "indoor"},
+            "lif": {"creator": {"from": None, "to": "x"}},
+            "tmap2": {"set": {"from": None, "to": "ros2"}, "action": {"from": "go", "to": "run"}},
+        }
+    }
+    none = Templates("default", {"tmap2": Own(None, {"action": "go", "osm": False, "pointset": None})})
+    assert template_changes(a, none) == {"templates": {"tmap2": {"pointset": {"from": None, "to": None}}}}
+
+
+def test_values_are_typed_as_json_has_them() -> None:
+    octomap = formats.get_format("octomap")
+    assert templates.check_values(octomap, {"bbox": "0,0,0,1,1,1"}) == {"bbox": [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]}
+    assert templates.check_values(TMAP2, {"xy_goal_tolerance": "0.5", "osm": "yes"}) == {
+        "osm": True,
+        "xy_goal_tolerance": 0.5,
+    }
+    with pytest.raises(Invalid) as caught:
+        templates.check_values(TMAP2, {"xy_goal_tolerance": -1, "colour": 2})
+    assert {p.where for p in caught.value.problems} == {"values.xy_goal_tolerance", "values.colour"}
