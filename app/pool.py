@@ -29,15 +29,49 @@ log = logging.getLogger(__name__)
 
 _spawn = multiprocessing.get_context("spawn")
 
+LOOK_SECONDS = 0.2
+"""How often a job in line looks whether it is still wanted."""
+
 
 class WorkerDied(FleetMapError):
     """The job ended its process (a crash, or out of memory) or overran its time."""
+
+
+class Cancelled(Unavailable):
+    """Nobody wants the job's result any more; it was stopped."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Worker:
     process: BaseProcess
     pipe: Connection
+
+
+class Stop:
+    """Stops one job from another thread, wherever it is: its process is killed, or it never gets one."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._process: BaseProcess | None = None
+        self.called = False
+
+    def __call__(self) -> None:
+        """Stop the job; it raises Cancelled unless it has just come to its end."""
+        with self._lock:
+            self.called = True
+            if self._process is not None:
+                self._process.kill()
+
+    def check(self) -> None:
+        """Cancelled where it was called."""
+        if self.called:
+            raise Cancelled("it was cancelled: ask for it again")
+
+    def hold(self, process: BaseProcess | None) -> None:
+        """From now on the job is at work in this process (None: no longer); Cancelled where it was called before."""
+        with self._lock:
+            self._process = process
+            self.check()
 
 
 class Pool:
@@ -73,21 +107,29 @@ class Pool:
         for worker in taken:
             self._idle.put(worker or self._new())
 
-    def run(self, function: Callable[..., Any], *args: Any, seconds: float | None = None) -> Any:
+    def run(
+        self, function: Callable[..., Any], *args: Any, seconds: float | None = None, stop: Stop | None = None
+    ) -> Any:
         """Call a module-level function in a worker and return its result; blocks, so call it from a thread.
 
         Raises what the function raises; WorkerDied where the process ended or overran; Unavailable where too much
-        waits already.
+        waits already; Cancelled after ``stop`` was called.
         """
         if not self._slots.acquire(blocking=False):
             raise Unavailable("too many conversions are waiting: try again in a few seconds")
         try:
-            worker, healthy = self._idle.get(), False
+            worker, healthy = self._turn(stop), False
             try:
                 if self._closed:
                     raise Unavailable("the server is stopping")
                 worker = worker or self._new()
-                ok, value = _ask(worker, function, args, self._seconds if seconds is None else seconds)
+                if stop is not None:
+                    stop.hold(worker.process)
+                try:
+                    ok, value = _ask(worker, function, args, self._seconds if seconds is None else seconds)
+                finally:
+                    if stop is not None:
+                        stop.hold(None)  # Cancelled comes before what its death looks like
                 healthy = True
             finally:
                 healthy = healthy and not self._closed
@@ -99,6 +141,15 @@ class Pool:
         if not ok:
             raise value
         return value
+
+    def _turn(self, stop: Stop | None) -> _Worker | None:
+        """Wait in line for a worker; None: one is to be started."""
+        if stop is None:
+            return self._idle.get()
+        while True:
+            stop.check()
+            with contextlib.suppress(queue.Empty):
+                return self._idle.get(timeout=LOOK_SECONDS)
 
     def close(self) -> None:
         """End all workers.

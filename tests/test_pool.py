@@ -16,7 +16,7 @@ import pytest
 
 from app import sandbox
 from app.errors import NotFound, Problem, TooLarge, Unavailable
-from app.pool import Pool, WorkerDied
+from app.pool import Cancelled, Pool, Stop, WorkerDied
 from app.sandbox import Allowed
 
 
@@ -104,6 +104,34 @@ def test_an_overrun_is_stopped_and_a_fresh_worker_goes_on(pool: Pool) -> None:
     with pytest.raises(WorkerDied, match=r"longer than 0\.3 seconds"):
         pool.run(work_sleep, 60.0, seconds=0.3)
     assert time.monotonic() - start < 60
+    assert pool.run(work_double, 1) == 2
+
+
+def test_a_job_is_stopped_at_work_and_in_line(pool: Pool) -> None:
+    pool.run(work_double, 1)
+    stops = Stop(), Stop()
+    told: list[BaseException] = []
+
+    def run(stop: Stop) -> None:
+        try:
+            pool.run(work_sleep, 60.0, stop=stop)
+        except Cancelled as error:
+            told.append(error)
+
+    threads = [threading.Thread(target=run, args=(stop,)) for stop in stops]
+    for thread in threads:
+        thread.start()
+        time.sleep(0.3)  # one is at work, the other in line
+    for stop, thread in reversed(list(zip(stops, threads, strict=True))):
+        stop()
+        thread.join(20)
+        assert not thread.is_alive()
+    assert len(told) == 2
+    with pytest.raises(Cancelled):
+        pool.run(work_double, 1, stop=stops[0])
+    late = Stop()
+    assert pool.run(work_double, 21, stop=late) == 42
+    late()  # its worker belongs to others by now
     assert pool.run(work_double, 1) == 2
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -22,6 +23,7 @@ from app.api.services import Here
 from app.convert import Maps, Recipe
 from app.convert.cache import Made
 from app.errors import Denied, FleetMapError, Unavailable
+from app.pool import Cancelled, Stop
 from app.store import Store
 from app.store.values import Job, rfc3339
 
@@ -43,8 +45,12 @@ class Started:
 
 @dataclass(slots=True)
 class _Running:
+    """A map in the making. asking: requests that wait for it. jobs: principal's id -> job id."""
+
     future: asyncio.Future[Made]
-    jobs: dict[str, str]  # principal's id -> job id
+    stop: Stop
+    asking: int = 0
+    jobs: dict[str, str] = field(default_factory=dict)
 
 
 class Work:
@@ -53,6 +59,7 @@ class Work:
     def __init__(self, store: Store, maps: Maps, seconds: float, count: Callable[[str, str], None]) -> None:
         self._store, self._maps, self._seconds, self._count = store, maps, seconds, count
         self._running: dict[str, _Running] = {}
+        self._lock = threading.Lock()
         self._threads = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="fleetmap-make")
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -61,26 +68,52 @@ class Work:
 
         Raises what making raises; Unavailable where too much is being made.
         """
-        running = self._running.get(recipe.key)
-        if running is None:
-            if len(self._running) >= AT_ONCE + WAITING:
-                raise Unavailable("too many maps are being made: try again in a few seconds")
-            future = asyncio.get_running_loop().run_in_executor(self._threads, self._maps.make, recipe)
-            running = self._running[recipe.key] = _Running(future, {})
-            future.add_done_callback(lambda done: self._finished(recipe, done))
-        done, _ = await asyncio.wait({running.future}, timeout=self._seconds)
-        if done:
-            return running.future.result()
-        known = running.jobs.get(who.id)
-        if known is not None:
-            return Started(await run_in_threadpool(self._store.job, known))
-        return Started(await self._as_job(recipe, running, who, address))
+        with self._lock:  # held for a moment only: whoever comes to a map keeps it from being stopped
+            running = self._running.get(recipe.key)
+            if running is None:
+                if len(self._running) >= AT_ONCE + WAITING:
+                    raise Unavailable("too many maps are being made: try again in a few seconds")
+                running = self._begin(recipe)
+            running.asking += 1
+        try:
+            done, _ = await asyncio.wait({running.future}, timeout=self._seconds)
+            if done:
+                return running.future.result()
+            known = running.jobs.get(who.id)
+            if known is not None:
+                return Started(await run_in_threadpool(self._store.job, known))
+            return Started(await self._as_job(recipe, running, who, address))
+        finally:
+            with self._lock:
+                running.asking -= 1
+
+    def cancel(self, job: str) -> bool:
+        """Stop the making that a job waits for, unless others wait for it too: whether it was of this process."""
+        with self._lock:
+            for key, running in self._running.items():
+                owner = next((who for who, known in running.jobs.items() if known == job), None)
+                if owner is None:
+                    continue
+                del running.jobs[owner]
+                if not running.jobs and not running.asking:
+                    running.stop()
+                    del self._running[key]  # who asks from now on begins anew
+                return True
+        return False
+
+    def _begin(self, recipe: Recipe) -> _Running:
+        stop = Stop()
+        future = asyncio.get_running_loop().run_in_executor(self._threads, self._maps.make, recipe, stop)
+        running = self._running[recipe.key] = _Running(future, stop)
+        future.add_done_callback(lambda _: self._finished(recipe, running))
+        return running
 
     def beat(self) -> None:
-        """Show that the jobs of this process are alive. Blocks."""
-        for running in list(self._running.values()):
-            for job in list(running.jobs.values()):
-                self._touch(job)
+        """Show that the jobs of this process are alive, and stop those that were cancelled elsewhere. Blocks."""
+        with self._lock:
+            jobs = [job for running in self._running.values() for job in running.jobs.values()]
+        for job in jobs:
+            self._touch(job)
 
     def close(self) -> None:
         """Let threads end; what is being made ends with the pool."""
@@ -120,14 +153,22 @@ class Work:
 
     def _touch(self, job: str) -> None:
         try:
-            if self._store.job(job).state == "running":
+            state = self._store.job(job).state
+            if state == "running":
                 self._store.update_job(job, state="running")
+            elif state == "cancelled":  # in another process of the server
+                self.cancel(job)
         except FleetMapError as error:
             log.warning("a job could not be kept alive: %s", error.detail)
 
-    def _finished(self, recipe: Recipe, done: asyncio.Future[Made]) -> None:
-        self._running.pop(recipe.key, None)
-        if done.cancelled() or done.exception() is not None:
+    def _finished(self, recipe: Recipe, running: _Running) -> None:
+        with self._lock:
+            if self._running.get(recipe.key) is running:
+                del self._running[recipe.key]
+        done = running.future
+        if done.cancelled() or isinstance(done.exception(), Cancelled):
+            self._count(recipe.format.name, "cancelled")
+        elif done.exception() is not None:
             self._count(recipe.format.name, "failed")
         elif done.result().fresh:  # else another request or process had just made it
             self._count(recipe.format.name, "made")
@@ -177,10 +218,13 @@ def get_job(id: JobPath, here: Here, who: Viewer) -> Response:
 
 @router.delete("/{id}", status_code=204, responses=told(None, 404), summary="Cancel or forget a job")
 def delete_job(id: JobPath, here: Here, who: Viewer) -> Response:
-    """Cancels a job that runs (what is half made is kept for the next one who asks); forgets one that has ended."""
+    """Cancels a job that runs: the work is stopped, unless somebody else waits for it too. Forgets one that has
+    ended.
+    """
     job = _mine(here, who, id)
     if as_dict(job)["state"] in ("queued", "running"):
         here.store.update_job(id, state="cancelled", detail="cancelled")
+        here.work.cancel(id)  # where another process is at it, that one notices within seconds
     else:
         here.store.delete_job(id)
     return Response(status_code=204)

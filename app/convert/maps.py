@@ -27,12 +27,12 @@ from app.errors import (
 from app.formats import Limits
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
-from app.pool import WorkerDied
+from app.pool import Stop, WorkerDied
 from app.store import Store
 from app.store.values import Version
 
 Run = Callable[..., Any]
-"""``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""
+"""``run(function, *args, stop=…)``: call a module-level function somewhere safe, return its result (``Pool.run``)."""
 
 
 TRIED = 1000
@@ -86,13 +86,13 @@ class Maps:
         """The map, only if it is made already."""
         return self.cache.get(recipe.key)
 
-    def make(self, recipe: Recipe) -> Made:
-        """The map; blocks until it is made.
+    def make(self, recipe: Recipe, stop: Stop | None = None) -> Made:
+        """The map; blocks until it is made. stop: ends the making from another thread, with Cancelled.
 
         CannotDerive where a step finds nothing to use: then ``recipe`` gives another way, if there is one.
         """
         try:
-            return self.cache.get_or_make(recipe.key, lambda: self._made(recipe))
+            return self.cache.get_or_make(recipe.key, lambda: self._made(recipe, stop))
         except CannotDerive as error:
             self._remember(_content(recipe.version, recipe.chain), Hindrance(error.step, error.detail, error.choose))
             raise
@@ -271,12 +271,13 @@ class Maps:
             raise UnreadableFile(f"the files could not be converted: {error.detail}") from error
         return converted
 
-    def _made(self, recipe: Recipe) -> Product:
+    def _made(self, recipe: Recipe, stop: Stop | None) -> Product:
         values = parameters.canonical(recipe.options)
         where = (self._store.database_url, str(self._store.blob_dir))
+        wanted = {} if stop is None else {"stop": stop}
         try:
             written: making.Written = self._run(
-                making.make, *where, recipe.version, recipe.format.name, values, recipe.chain
+                making.make, *where, recipe.version, recipe.format.name, values, recipe.chain, **wanted
             )
         except WorkerDied as error:
             raise CannotConvert(f"{recipe.format.name} could not be made: {error.detail}") from error

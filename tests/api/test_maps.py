@@ -8,6 +8,7 @@ import threading
 import time
 import zipfile
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import pytest
@@ -344,9 +345,9 @@ def test_work_that_takes_long_becomes_a_job(tmp_path: Path, monkeypatch: pytest.
 
     quick, gate = Maps.make, threading.Event()
 
-    def slow(self: Maps, recipe: object) -> object:
+    def slow(self: Maps, recipe: object, stop: object) -> object:
         assert gate.wait(30)
-        return quick(self, recipe)  # type: ignore[arg-type]
+        return quick(self, recipe, stop)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Maps, "make", slow)
     with running(settings_for(tmp_path, job_seconds=0.2)) as api:
@@ -380,7 +381,7 @@ def test_a_job_is_cancelled_or_fails(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     gate = threading.Event()
 
-    def broken(self: Maps, recipe: object) -> object:
+    def broken(self: Maps, recipe: object, stop: object) -> object:
         assert gate.wait(30)
         raise CannotConvert("it cannot be done")
 
@@ -402,3 +403,73 @@ def test_a_job_is_cancelled_or_fails(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert job["problem"]["detail"] == "it cannot be done"
         assert api.get(cancelled).json()["state"] == "cancelled"
         api.problem("GET", "/maps/farm/tmap2", 422)
+
+
+def _linger(seconds: float) -> None:
+    time.sleep(seconds)
+
+
+def test_cancelling_stops_the_work_unless_others_wait_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from app.pool import Pool
+
+    quick, slow, begun = Pool.run, [60.0], []
+
+    def run(self: Pool, function: Any, *args: Any, **more: Any) -> Any:
+        """The worker has something long to do first, in its process, where only killing it helps."""
+        if "stop" in more and slow:
+            begun.append(more["stop"])
+            quick(self, _linger, slow[0], stop=more["stop"])
+        return quick(self, function, *args, **more)
+
+    monkeypatch.setattr(Pool, "run", run)
+    with running(settings_for(tmp_path, job_seconds=0.2, conversion_workers=1)) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
+        mine = api.get("/maps/farm/tmap2", 202).headers["location"]
+        other = api.token_for("viewer")
+        theirs = other.get("/maps/farm/tmap2", 202).headers["location"]
+        assert len(begun) == 1
+        api("DELETE", mine, 204)
+        assert api.get(mine).json()["state"] == "cancelled"
+        assert not begun[0].called, "somebody else waits for it"
+        assert other.get(theirs).json()["state"] == "running"
+        again = api.get("/maps/farm/tmap2", 202).headers["location"]
+        assert again != mine
+        other("DELETE", theirs, 204)
+        assert not begun[0].called
+        begin = time.monotonic()
+        api("DELETE", again, 204)
+        assert begun[0].called
+        slow.clear()
+        deadline = begin + 50
+        while api.get("/maps/farm/tmap2", None).status_code == 202:
+            assert time.monotonic() < deadline, "the worker went on with what nobody wants"
+            time.sleep(0.1)
+        assert [api.get(where).json()["state"] for where in (mine, theirs, again)] == ["cancelled"] * 3
+        assert 'fleetmap_conversions_total{format="tmap2",result="cancelled"} 1.0' in api.get("/metrics").text
+
+
+def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from app.convert import Maps
+    from app.pool import Stop
+
+    stopped = threading.Event()
+
+    def endless(self: Maps, recipe: object, stop: Stop) -> object:
+        for _ in range(600):
+            if stop.called:
+                stopped.set()
+            stop.check()
+            time.sleep(0.05)
+        raise AssertionError("nobody stopped it")
+
+    monkeypatch.setattr(Maps, "make", endless)
+    with running(settings_for(tmp_path, job_seconds=0.1)) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
+        job = api.get("/maps/farm/tmap2", 202).json()["id"]
+        here = api.app.state.services
+        here.store.update_job(job, state="cancelled", detail="cancelled")
+        assert not stopped.is_set()
+        here.work.beat()
+        assert stopped.wait(10)
