@@ -170,7 +170,7 @@ class Site:
         self.fence: Any = None
         self.is_given = False
         self.files: dict[str, bytes] = {}
-        self._objects: dict[str, list[tuple[str, Any, Properties]]] = {}
+        self._objects: dict[tuple[str, str], list[tuple[str, Any, Properties]]] = {}
         self._zones: dict[str, list[tuple[str, Any, Properties]]] = {}
         self._nodes: dict[str, tuple[str, tuple[float, float], dict[str, Any]]] = {}
         self._edges: dict[str, tuple[str, str, Any, dict[str, Any]]] = {}
@@ -197,10 +197,11 @@ class Site:
                 self.notes.drop("holes of the fence", len(pieces[0].interiors), "a fence is one ring")
         else:
             self.fence = shapely.orient_polygons(rounded(own))
-        self._resolution()
+        _ = self.resolution
         return self.fence
 
-    def _resolution(self) -> float:
+    @property
+    def resolution(self) -> float:
         """Metres a cell. CannotGenerate where there would be too many cells."""
         box = self.fence.bounds
         fine = (r for r in RESOLUTIONS if _cells(box, r) <= EASY)
@@ -231,11 +232,13 @@ class Site:
         level: str = GROUND,
         colour: str | None = None,
         seen: Any = None,
+        family: str = NAME,
         **words: Any,
     ) -> None:
         """An object. shapes: its solids (``app.model.solids``), in the frame of its pose (x, y, z, yaw).
 
         colour: of its geometry in the picture, or of ``seen`` where that is another one (a crown over a trunk).
+        family: the name of its part, for formats that look among their own (walls, doors and lifts: ``openrmf``).
         """
         self._count += 1
         if self._count > MAX_OBJECTS:
@@ -246,7 +249,7 @@ class Site:
             said["pose"] = [mm(x), mm(y), mm(z), 0.0, 0.0, angle(yaw)]
         if shapes:
             said["shapes"] = [_plain(shape) for shape in shapes]
-        self._objects.setdefault(level, []).append((i, rounded(geometry), said))
+        self._objects.setdefault((level, family), []).append((i, rounded(geometry), said))
         if colour is not None:
             shape = geometry if seen is None else seen
             self._bodies.setdefault(level, []).append((_NUMBER[colour], _listed(shape)))
@@ -361,8 +364,8 @@ class Site:
         if not self.is_given:
             ring = [("fence", self.fence, {"kind": "fence"})]
             parts[PartKey("location", GROUND, SITE)] = features(ring, "local")
-        for level, rows in self._objects.items():
-            parts[PartKey("objects", level, NAME)] = features(rows, "local")
+        for (level, family), rows in self._objects.items():
+            parts[PartKey("objects", level, family)] = features(rows, "local")
         if self.files:
             parts[PartKey("resources", GROUND, NAME)] = Resources(dict(sorted(self.files.items())))
         grids = self._grids(parts)
@@ -385,7 +388,7 @@ class Site:
 
     def _grids(self, parts: Mapping[PartKey, Part]) -> dict[PartKey, Part]:
         """The slice of the objects on each level, of which one connected piece stays free."""
-        resolution = self._resolution()
+        resolution = self.resolution
         if self.options.resolution is None and resolution != RESOLUTIONS[0]:
             why = f"{RESOLUTIONS[0]} m would be more than {EASY} cells"
             self.notes.fill("resolution", resolution, why)

@@ -33,7 +33,9 @@ CAME = Provenance("generated")
 def make(name: str, seed: int = 7, given: Layers | None = None, **values: Any) -> tuple[Layers, Notes]:
     """A site and what its generator said."""
     notes = Notes()
-    return generate.run(name, seed, values, given or Layers(), notes), notes
+    before = given or Layers()
+    made = generate.run(name, seed, values, before, notes)
+    return Layers({**before.parts, **made.parts}, made.datum, made.levels), notes
 
 
 def digest(layers: Layers) -> str:

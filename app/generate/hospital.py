@@ -1,0 +1,143 @@
+"""A hospital ward: patients' rooms along a wide corridor, with a nurse station in its middle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from app.derive import Notes
+from app.generate import Source, _building, generates
+from app.generate._building import Furniture, Room, Storeys
+from app.generate._site import Site, SiteOptions
+from app.model.layers import Layers
+from app.parameters import parameter
+
+
+@dataclass(frozen=True, slots=True)
+class Options(SiteOptions):
+    """How large the wards are, and how many lie above each other."""
+
+    levels: int = parameter(
+        1, "wards above each other; from two on a lift joins them", minimum=1, maximum=_building.MAX_LEVELS
+    )
+    length: float = parameter(36.0, "of the corridor", minimum=4.0, maximum=500.0, unit="m")
+    depth: float = parameter(6.0, "of the rooms on each side of it", minimum=2.5, maximum=50.0, unit="m")
+    corridor: float = parameter(3.0, "width of the corridor", minimum=1.2, maximum=20.0, unit="m")
+    room_width: tuple[float, float] = parameter(
+        (4.0, 6.6), "least,most width of a room", minimum=2.0, maximum=100.0, unit="m"
+    )
+    door_width: float = parameter(1.4, "of the rooms' doors", minimum=0.6, maximum=3.0, unit="m")
+    storey_height: float = parameter(3.8, "from floor to floor", minimum=2.0, maximum=20.0, unit="m")
+    furniture: bool = parameter(True, "whether there are beds, cabinets and counters")
+
+
+@generates(
+    {"location", "objects", "occupancy", "topology", "zones", "imagery"},
+    also=frozenset({"location"}),
+    parameters=Options,
+)
+def hospital(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
+    """A hospital ward: rooms with beds, a nurse station and a corridor; several wards are joined by a lift."""
+    least, most = options.room_width
+    lift = options.levels > 1
+    measures = Storeys(
+        options.levels, options.length, options.depth, options.corridor, least, most, options.door_width,
+        options.storey_height, lift,
+    )  # fmt: skip
+    _building.check(measures, options.robot_radius)
+    site = Site(given, options, notes, levels=_building.levels_of(measures))
+
+    def node_of(room: Room) -> tuple[float, float]:
+        return _building.goal(room, options.robot_radius)
+
+    building = _building.build(site, measures, options.robot_radius, source, _kinds, node_of)
+    for k, level in enumerate(_building.names_of(options.levels)):
+        chance = source.stream(f"furniture/{k}")
+        for room in (room for room in building.rooms if room.level == level):
+            things = building.furnish(room, node_of(room))
+            if room.kind == "supply":
+                building.charger(things, node_of(room))
+            if options.furniture:
+                _FURNISH[room.kind](things, room, chance)
+    _building.slow_zones(building)
+    return site.finish(ground="grass")
+
+
+def _kinds(level: int, side: int, widths: list[float], chance: np.random.Generator) -> list[str]:  # noqa: ARG001
+    """Patients' rooms; below the corridor the nurse station in the middle, supplies and treatment beside it."""
+    out = ["patients"] * len(widths)
+    middle = len(out) // 2
+    if side < 0:
+        out[middle] = "nurse_station"
+        for n, kind in ((middle - 1, "supply"), (middle + 1, "treatment")):
+            if 0 <= n < len(out):
+                out[n] = kind
+    elif len(out) > 2:
+        out[int(chance.integers(0, len(out)))] = "lounge"
+    return out
+
+
+def _beds(things: Furniture, room: Room, chance: np.random.Generator) -> None:
+    """Beds with their heads at the outer wall, a cabinet beside each, and a wardrobe."""
+    width = room.box[2] - room.box[0]
+    count = max(1, int((width - 0.6) / 2.0))
+    step = width / count
+    for k in range(count):
+        along = step * (k + 0.5)
+        if things.put("bed", along, room.depth - 1.1, (0.95, 2.1, 0.6), "white"):
+            things.put("cabinet", along + 0.8, room.depth - 0.3, (0.45, 0.45, 0.7), "wood")
+            if chance.random() < 0.5:
+                things.put("chair", along - 0.8, room.depth - 1.6, (0.5, 0.5, 0.9), "goods")
+    things.put("wardrobe", width - 0.35, 0.9, (0.6, 1.2, 2.0), "wood")
+    things.put("basin", 0.3, 0.9, (0.5, 0.5, 0.9), "metal")
+
+
+def _station(things: Furniture, room: Room, chance: np.random.Generator) -> None:
+    """A counter towards the corridor on both sides of the way in, desks behind it."""
+    width, door = room.box[2] - room.box[0], room.door - room.box[0]
+    for low, high in ((0.2, door), (door, width - 0.2)):
+        keep = things.building.radius + 3 * things.building.site.resolution + 0.2
+        start, end = (low, high - keep) if low < door else (low + keep, high)
+        if end - start > 0.6:
+            things.put("counter", (start + end) / 2, 0.5, (end - start, 0.6, 1.1), "furniture")
+    for k in range(int((width - 0.4) / 1.9)):
+        if things.put("desk", 1.1 + 1.9 * k, room.depth - 0.5, (1.6, 0.8, 0.74), "furniture", style="desk"):
+            shift = 0.3 * (float(chance.random()) - 0.5)
+            things.put("chair", 1.1 + 1.9 * k + shift, room.depth - 1.25, (0.5, 0.5, 0.9), "goods")
+
+
+def _supply(things: Furniture, room: Room, chance: np.random.Generator) -> None:
+    """Shelves along both side walls."""
+    width = room.box[2] - room.box[0]
+    for k in range(int((room.depth - 0.4) / 1.1)):
+        for along in (0.3, width - 0.3):
+            if chance.random() < 0.85:
+                things.put("shelf", along, 0.75 + 1.1 * k, (0.5, 1.0, 2.0), "shelf")
+
+
+def _treatment(things: Furniture, room: Room, chance: np.random.Generator) -> None:
+    """A couch, cupboards along a wall, a trolley."""
+    width = room.box[2] - room.box[0]
+    things.put("bed", 0.7, room.depth - 1.3, (0.7, 2.0, 0.7), "white")
+    for k in range(int((room.depth - 1.0) / 1.3)):
+        things.put("cupboard", width - 0.3, 0.9 + 1.3 * k, (0.5, 1.2, 1.8), "metal")
+    things.put("trolley", 1.8 + 0.4 * float(chance.random()), room.depth - 0.6, (0.6, 0.45, 0.9), "metal")
+
+
+def _lounge(things: Furniture, room: Room, chance: np.random.Generator) -> None:
+    """Seats along the outer wall, and a small table."""
+    width = room.box[2] - room.box[0]
+    for k in range(int((width - 0.4) / 0.8)):
+        if chance.random() < 0.85:
+            things.put("seat", 0.6 + 0.8 * k, room.depth - 0.4, (0.6, 0.6, 0.8), "goods")
+    things.put("table", 0.8 if chance.random() < 0.5 else width - 0.8, 1.6, (0.8, 0.8, 0.5), "wood", style="table")
+
+
+_FURNISH = {
+    "patients": _beds,
+    "nurse_station": _station,
+    "supply": _supply,
+    "treatment": _treatment,
+    "lounge": _lounge,
+}
