@@ -12,7 +12,7 @@ ARGS ?=
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo $(BIN)/uv)
 SYNC := UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen --extra server --inexact --quiet --no-python-downloads
 
-.PHONY: run test lint bench install install-dev clean
+.PHONY: run test lint bench chaos install install-dev clean
 
 run: install
 	@$(BIN)/fleetmap serve --demo $(ARGS)
@@ -29,6 +29,10 @@ lint: install-dev
 
 bench: install-dev
 	@$(BIN)/python -m tests.bench $(ARGS)
+
+# Kills of the server, the router and the database at random moments: 50 of each; `make test` does 10.
+chaos: install-dev
+	@FLEETMAP_CHAOS=$${FLEETMAP_CHAOS:-50} $(BIN)/python -m pytest -s tests/chaos $(ARGS)
 
 install: $(VENV)/.installed
 
