@@ -129,7 +129,8 @@ def _write(
     notes = Notes()
     with output.progress_bar(f"generating {site}"):
         made = generate.run(site, seed, own, Layers(datum=datum), notes)
-        came = Provenance("generated", steps=(generate.step(site, seed, own, {}),))
+        how = generate.step(site, seed, own, {}, made.datum if datum is None else None)
+        came = Provenance("generated", steps=(how,))
         result = written(made, to, {n: v for n, v in values.items() if n not in ours}, came)
     report: dict[str, Any] = {**result.report}
     report["warnings"] = [w.as_dict() for w in notes.warnings] + report["warnings"]

@@ -20,7 +20,7 @@ from app.model.frame import GROUND
 from app.model.layers import LAYERS, VECTOR_LAYERS, Layer, Layers, PartKey
 from app.model.templates import NO_TEMPLATES, Templates
 from app.store import Store
-from app.store.values import PartEntry, Version
+from app.store.values import PartEntry, Version, datum_information
 from app.templates import DEFAULT, resolve
 
 
@@ -213,7 +213,8 @@ def _told(
             line["attribution"] = list(noted.get(key, ()))
         out.append(line)
     if used.datum is not None and not any(line["layer"] == "location" for line in out):
-        site = {"layer": "location", "level": GROUND, "name": "datum", "information": "raw"}
+        site = {"layer": "location", "level": GROUND, "name": "datum"}
+        site["information"] = datum_information(used.datum, entries.values())
         out.insert(0, {**site, "steps": [], "sources": [], "attribution": []})
     return out
 

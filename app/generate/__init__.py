@@ -20,6 +20,7 @@ import numpy as np
 from app import parameters
 from app.derive import Notes
 from app.errors import CannotGenerate, Invalid, MissingLayer, NotFound, Problem
+from app.model.frame import Datum
 from app.model.layers import Layer, Layers, PartKey, is_empty
 
 MAX_SEED = 2**63 - 1
@@ -157,12 +158,19 @@ def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: N
     return Layers(fresh, given.datum or made.datum, made.levels)
 
 
-def step(name: str, seed: int, values: Mapping[str, Any], used: Mapping[PartKey, str]) -> dict[str, Any]:
-    """How it was made, for provenance: enough to make it again. used: hashes of the parts that it was given."""
+def step(
+    name: str, seed: int, values: Mapping[str, Any], used: Mapping[PartKey, str], datum: Datum | None = None
+) -> dict[str, Any]:
+    """How it was made, for provenance: enough to make it again.
+
+    used: hashes of the parts that it was given. datum: the one that it made up.
+    """
     known, options = check(name, seed, values)
     defaults = {p["name"]: p["default"] for p in parameters.describe(known.parameters)}
     members: dict[str, Any] = {"step": name, "seed": seed, "version": known.version}
     members["parameters"] = {**defaults, **parameters.canonical(options)}
+    if datum is not None:
+        members["datum"] = datum.as_dict()
     if used:
         members["given"] = [
             {"layer": k.layer, "level": k.level, "name": k.name, "hash": digest} for k, digest in sorted(used.items())

@@ -46,7 +46,8 @@ def prepare_generation(
     own = {e.key: e for e in base.parts if e.count > 0}
     _check_free(order, known, made, own)
     credit = tuple(dict.fromkeys(text for k in sorted(used) for text in used[k].provenance.attribution))
-    how = generate.step(order.generator, order.seed, order.values, {k: e.hash for k, e in used.items()})
+    made_up = made.datum if base.datum is None else None
+    how = generate.step(order.generator, order.seed, order.values, {k: e.hash for k, e in used.items()}, made_up)
     sources = tuple(sorted({s for e in used.values() for s in e.provenance.sources}))
     provenance = Provenance("generated", None, sources, None, (how,), credit)
     operations: list[Operation] = [Replace(key, part, provenance) for key, part in sorted(made.parts.items())]

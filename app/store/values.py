@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
 from typing import Any, Literal
@@ -156,6 +156,13 @@ class PartEntry:
     digest: str = ""
 
 
+def datum_information(datum: Datum, parts: Iterable[PartEntry]) -> Information:
+    """Whether people told the datum, or a generator made it up with one of the parts."""
+    said = datum.as_dict()
+    made_up = any(step.get("datum") == said for e in parts for step in e.provenance.steps)
+    return "generated" if made_up else "raw"
+
+
 @dataclass(frozen=True, slots=True)
 class Version:
     """An immutable state of an environment.
@@ -219,7 +226,7 @@ class Version:
         for layer in INFORMATION_LAYERS:
             kinds = {e.provenance.information for e in self.parts if e.key.layer == layer and e.count}
             if layer == "location" and self.datum is not None and not kinds:
-                kinds = {"raw"}
+                kinds = {datum_information(self.datum, self.parts)}
             out[layer] = next((kind for kind in order if kind in kinds), "missing")
         return out
 

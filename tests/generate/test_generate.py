@@ -103,7 +103,13 @@ def test_what_is_made_is_a_version_that_says_how(ingest: Ingest, store: Store) -
     entry = next(e for e in made.version.parts if e.key == POSTS)
     assert entry.count == 5
     assert entry.provenance.steps == (
-        {"step": "some_posts", "seed": 7, "version": 1, "parameters": {"count": 5, "fence": True}},
+        {
+            "step": "some_posts",
+            "seed": 7,
+            "version": 1,
+            "parameters": {"count": 5, "fence": True},
+            "datum": Datum(52.0, 5.0).as_dict(),
+        },
     )
     again = ingest.generate("here", order(count=5), message="", author="a")
     assert again.status == "unchanged"
@@ -125,6 +131,17 @@ def test_a_new_site_takes_the_place_of_an_earlier_one_and_of_nothing_else(ingest
     with pytest.raises(Conflict, match="replace=true"):
         ingest.generate("here", order(), message="", author="a")
     assert ingest.generate("here", order(replace=True), message="", author="a").status == "created"
+
+
+def test_whose_the_datum_is(ingest: Ingest, store: Store) -> None:
+    ingest.generate("here", order(fence=False), message="", author="a")
+    assert store.version("here").information["location"] == "generated"
+    ingest.set_datum("here", Datum(53.0, 6.0), author="a")
+    assert store.version("here").information["location"] == "raw"
+    made = ingest.generate("here", order(fence=False, seed=8), message="", author="a").version
+    assert made is not None
+    assert made.datum == Datum(53.0, 6.0)
+    assert made.information["location"] == "raw"
 
 
 def test_one_that_works_on_a_layer_replaces_it(ingest: Ingest, store: Store) -> None:
