@@ -50,6 +50,9 @@ EASY = 2**22
 WIDEST = 20.0
 """Metres of free width beyond which an edge is not looked at."""
 
+SLACK = 1.5
+"""Cells by which a way and an obstacle may come nearer to each other in a grid than they are."""
+
 MOST_NODES = 20_000
 
 COLOURS: Mapping[str, tuple[int, int, int]] = {
@@ -111,7 +114,8 @@ class SiteOptions:
     )
     resolution: float | None = parameter(
         None,
-        f"metres a cell; default: {RESOLUTIONS[0]}, or as much coarser as keeps a grid below 2^22 cells",
+        f"metres a cell; default: {RESOLUTIONS[0]}, or coarser where a grid would have more than 2^22 cells and "
+        "still shows the ways",
         minimum=0.01,
         maximum=2.0,
         unit="m",
@@ -140,9 +144,12 @@ def rectangle(x: float, y: float, yaw: float, length: float, width: float) -> An
     return rounded(shapely.Polygon([(x + c * u - s * v, y + s * u + c * v) for u, v in corners]))
 
 
+_CIRCLE = [(round(math.cos(math.pi * k / 8), 6), round(math.sin(math.pi * k / 8), 6)) for k in range(16)]
+
+
 def disc(x: float, y: float, radius: float) -> Any:
     """A polygon of 16 sides around a middle."""
-    return rounded(shapely.Point(x, y).buffer(radius, quad_segs=4))
+    return shapely.Polygon([(mm(x + radius * c), mm(y + radius * s)) for c, s in _CIRCLE])
 
 
 def orientation(yaw: float) -> list[float]:
@@ -178,14 +185,17 @@ class Site:
         self._bodies: dict[str, list[tuple[int, list[Any]]]] = {}
         self._base: dict[str, str] = {}
         self._count = 0
+        self._room = math.inf
 
     # --- the ground --------------------------------------------------------------------------------------------------
 
-    def bounded(self, own: Any) -> Any:
+    def bounded(self, own: Any, *, room: float = math.inf) -> Any:
         """The fence: the environment's where it has one (the largest of several polygons), else ``own``.
 
-        own: a polygon in metres. Raises CannotGenerate where a grid of it would be too large.
+        own: a polygon in metres. room: metres between a robot on its way and what stands beside it, at the narrowest:
+        the cells are fine enough to show it. Raises CannotGenerate where a grid of it would be too large.
         """
+        self._room = room
         known = fences(self.given, self.notes).get(GROUND)
         if known is not None:
             pieces = [p for p in shapely.get_parts(known) if p.geom_type == "Polygon"]
@@ -204,8 +214,9 @@ class Site:
     def resolution(self) -> float:
         """Metres a cell. CannotGenerate where there would be too many cells."""
         box = self.fence.bounds
-        fine = (r for r in RESOLUTIONS if _cells(box, r) <= EASY)
-        asked = self.options.resolution or next(fine, RESOLUTIONS[-1])
+        easy = next((r for r in RESOLUTIONS if _cells(box, r) <= EASY), RESOLUTIONS[-1])
+        fine = max((r for r in RESOLUTIONS if SLACK * r <= self._room + 1e-9), default=RESOLUTIONS[0])
+        asked = self.options.resolution or min(easy, fine)
         if _cells(box, asked) * len(self.levels) > MAX_CELLS:
             side = f"{box[2] - box[0]:.0f} × {box[3] - box[1]:.0f} m"
             raise refused(
@@ -390,7 +401,7 @@ class Site:
         """The slice of the objects on each level, of which one connected piece stays free."""
         resolution = self.resolution
         if self.options.resolution is None and resolution != RESOLUTIONS[0]:
-            why = f"{RESOLUTIONS[0]} m would be more than {EASY} cells"
+            why = f"{RESOLUTIONS[0]} m would be more than {EASY} cells; a finer one can be asked for"
             self.notes.fill("resolution", resolution, why)
         asked = Parameters(height=self.options.height, resolution=resolution)
         own = Notes()

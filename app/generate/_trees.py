@@ -1,0 +1,100 @@
+"""Plants as solids, and the meshes that they share."""
+
+from __future__ import annotations
+
+import math
+import struct
+from functools import cache
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.generate._field import Field, between
+from app.generate._site import Site, disc, mm
+
+CROWN = "models/crown/meshes/crown.stl"
+CROWNS = ("crown", "crown_light", "crown", "crown_dark")
+
+MOST_TREES = 60_000
+"""A trunk and a crown have 144 triangles; ten millions are what a derivation looks at."""
+
+MOST_PLANTS = 50_000
+MOST_IN_ROW = 9_000
+"""Solids of one object, of which ``app.model.solids`` takes 10 000."""
+
+
+@cache
+def crown_mesh() -> bytes:
+    """A ball of radius 1 with 80 sides, as binary STL: a crown is one of these, stretched."""
+    g = (1 + math.sqrt(5)) / 2
+    corners = np.array(
+        [(a * s, b * t, 0.0) for a, b in ((1.0, g),) for s in (-1, 1) for t in (-1, 1)]
+        + [(0.0, a * s, b * t) for a, b in ((1.0, g),) for s in (-1, 1) for t in (-1, 1)]
+        + [(b * t, 0.0, a * s) for a, b in ((1.0, g),) for s in (-1, 1) for t in (-1, 1)]
+    )
+    corners /= math.sqrt(1 + g * g)
+    side = 2 / math.sqrt(1 + g * g)
+    n = range(12)
+    near = np.abs(np.linalg.norm(corners[:, None] - corners[None], axis=2) - side) < 1e-6
+    faces = [(i, j, k) for i in n for j in n if j > i and near[i, j] for k in n if k > j and near[i, k] and near[j, k]]
+    out = []
+    for face in faces:
+        a, b, c = (corners[k] for k in face)
+        ab, bc, ca = (m / np.linalg.norm(m) for m in (a + b, b + c, c + a))
+        out += [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    rows = []
+    for triangle in np.round(np.array(out), 6) + 0.0:
+        a, b, c = triangle
+        if np.dot(np.cross(b - a, c - a), a + b + c) < 0:
+            b, c = c, b
+        normal = np.cross(b - a, c - a)
+        normal = np.round(normal / np.linalg.norm(normal), 6) + 0.0
+        rows.append(struct.pack("<12fH", *normal, *a, *b, *c, 0))
+    return b"crown".ljust(80, b"\0") + struct.pack("<I", len(rows)) + b"".join(rows)
+
+
+def tree(
+    site: Site, i: str, at: tuple[float, float], *, trunk: float, height: float, crown: float, below: float, tint: int
+) -> None:
+    """A tree: a trunk of a radius, and a crown of a radius from ``below`` to ``height`` metres above the ground."""
+    site.files[CROWN] = crown_mesh()
+    middle, half = mm((below + height) / 2), mm((height - below) / 2)
+    stem = mm(below + half / 2)
+    shapes: list[dict[str, Any]] = [
+        {"type": "cylinder", "radius": mm(trunk), "length": stem, "pose": [0.0, 0.0, mm(stem / 2), 0.0, 0.0, 0.0]},
+        {
+            "type": "mesh",
+            "file": CROWN,
+            "scale": [mm(crown), mm(crown), half],
+            "pose": [0.0, 0.0, middle, 0.0, 0.0, 0.0],
+        },
+    ]
+    site.put(
+        i,
+        "tree",
+        shapely.Point(at),
+        shapes=shapes,
+        pose=(at[0], at[1], 0.0, 0.0),
+        colour=CROWNS[tint % len(CROWNS)],
+        seen=disc(at[0], at[1], crown),
+        width=mm(2 * trunk),
+        height=mm(height),
+    )
+
+
+def jittered(stream: np.random.Generator, count: int, most: float) -> Any:
+    """Offsets float64 [n, 2] along and across, at most so many metres, evenly spread."""
+    return np.round((2.0 * stream.random((count, 2)) - 1.0) * most, 3)
+
+
+def places(out: Field, stream: np.random.Generator, kind: str, step: float, most: float) -> list[list[Any]]:
+    """The places (u, v) of what stands in the rows of a kind, row by row; none beyond a row's ends."""
+    found = []
+    for row in out.rows:
+        if row.kind == kind:
+            along = np.array(between(row, step))
+            offset = jittered(stream, len(along), most)
+            u = np.clip(along + offset[:, 0], row.low, row.high)
+            found.append([(mm(a), mm(row.v + b)) for a, b in zip(u, offset[:, 1], strict=True)])
+    return found

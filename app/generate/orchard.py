@@ -1,0 +1,73 @@
+"""Generator ``orchard``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from app.derive import Notes
+from app.generate import Source, _field, _trees, generates
+from app.generate._field import FieldOptions
+from app.generate._site import Site, refused
+from app.model.layers import Layers
+from app.parameters import parameter
+
+
+@dataclass(frozen=True, slots=True)
+class Orchard(FieldOptions):
+    """Parameters of an orchard."""
+
+    rows: int | None = parameter(
+        None, "rows of trees; default: as many as the fence holds, 8 without one", minimum=2, maximum=_field.MOST_ROWS
+    )
+    row_spacing: float = parameter(3.6, "from row to row", minimum=1.0, maximum=30.0, unit="m")
+    tree_spacing: float = parameter(1.8, "from tree to tree in a row", minimum=0.5, maximum=30.0, unit="m")
+    jitter: float = parameter(0.1, "how far a tree may stand from its place", minimum=0.0, maximum=5.0, unit="m")
+    tree_height: float = parameter(3.2, "of the trees", minimum=1.0, maximum=30.0, unit="m")
+    crown_diameter: float = parameter(1.6, "of the trees' crowns", minimum=0.3, maximum=20.0, unit="m")
+    trunk_diameter: float = parameter(0.16, "of the trees' trunks", minimum=0.04, maximum=2.0, unit="m")
+
+
+@generates(
+    {"location", "objects", "occupancy", "topology", "zones", "imagery", "resources"},
+    parameters=Orchard,
+    also={"location"},
+)
+def orchard(given: Layers, options: Orchard, source: Source, notes: Notes) -> Layers:
+    """An orchard: rows of trees with crowns, headlands, a yard with charging docks, and a network of its aisles."""
+    if options.crown_diameter < options.trunk_diameter:
+        raise refused("crown_diameter", "a crown is no thinner than its trunk")
+    site = Site(given, options, notes)
+    lines = _field.numbered(options.rows or _field.MOST_ROWS)
+    out = _field.open_field(
+        site,
+        options,
+        lines,
+        own=None if options.rows else 8,
+        spacing=options.row_spacing,
+        half=options.trunk_diameter / 2 + options.jitter,
+    )
+    trees = sum(int(row.length / options.tree_spacing) + 1 for row in out.rows)
+    if trees > _trees.MOST_TREES:
+        raise refused("tree_spacing", f"there would be {trees} trees; the limit is {_trees.MOST_TREES}")
+    _field.ground(out, field_colour="meadow")
+    for row in out.rows:
+        site.mark(f"row{row.number}", "tree_row", out.line(row), name=f"Row {row.number}")
+        site.draw(out.strip(row, min(1.0, options.row_spacing / 2)), "soil")
+    size = source.stream("size")
+    stood = _trees.places(out, source.stream("places"), "row", options.tree_spacing, options.jitter)
+    for row, found in zip(out.rows, stood, strict=True):
+        drawn = size.random((len(found), 3))
+        for k, ((u, v), (a, b, c)) in enumerate(zip(found, drawn.tolist(), strict=True), 1):
+            height = options.tree_height * (0.85 + 0.15 * a)
+            _trees.tree(
+                site,
+                f"tree{row.number}-{k}",
+                out.at(u, v),
+                trunk=options.trunk_diameter / 2,
+                height=height,
+                crown=max(options.trunk_diameter, options.crown_diameter * (0.8 + 0.2 * b)) / 2,
+                below=0.25 * height,
+                tint=int(4 * c),
+            )
+    _field.network(out, _field.yard(out), aisle_speed=0.8, lane_speed=1.2)
+    return site.finish(ground="grass")

@@ -1,0 +1,113 @@
+"""Generator ``vineyard``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from app.derive import Notes
+from app.generate import Source, _field, _trees, generates
+from app.generate._field import Field, FieldOptions, Row
+from app.generate._site import Site, mm, rectangle, refused
+from app.model.layers import Layers
+from app.parameters import parameter
+
+
+@dataclass(frozen=True, slots=True)
+class Vineyard(FieldOptions):
+    """Parameters of a vineyard."""
+
+    rows: int | None = parameter(
+        None, "rows of vines; default: as many as the fence holds, 9 without one", minimum=2, maximum=_field.MOST_ROWS
+    )
+    row_spacing: float = parameter(2.5, "from row to row", minimum=1.0, maximum=10.0, unit="m")
+    vine_spacing: float = parameter(1.2, "from vine to vine in a row", minimum=0.3, maximum=10.0, unit="m")
+    jitter: float = parameter(0.05, "how far a vine may stand from its place", minimum=0.0, maximum=1.0, unit="m")
+    post_spacing: float = parameter(6.0, "from post to post of the trellis", minimum=1.0, maximum=30.0, unit="m")
+    canopy_width: float = parameter(0.5, "of the leaves on the wires", minimum=0.1, maximum=3.0, unit="m")
+    canopy_base: float = parameter(
+        0.7, "of the leaves' lower side above the ground", minimum=0.1, maximum=3.0, unit="m"
+    )
+    canopy_top: float = parameter(1.9, "of the leaves' upper side above the ground", minimum=0.3, maximum=4.0, unit="m")
+
+
+@generates({"location", "objects", "occupancy", "topology", "zones", "imagery"}, parameters=Vineyard, also={"location"})
+def vineyard(given: Layers, options: Vineyard, source: Source, notes: Notes) -> Layers:
+    """A vineyard: vines on trellises with posts and wires that no robot may pass, headlands, and a yard."""
+    if options.canopy_top <= options.canopy_base:
+        raise refused("canopy_top", "must be above canopy_base")
+    site = Site(given, options, notes)
+    out = _field.open_field(
+        site,
+        options,
+        _field.numbered(options.rows or _field.MOST_ROWS),
+        own=None if options.rows else 9,
+        spacing=options.row_spacing,
+        half=options.canopy_width / 2 + options.jitter,
+    )
+    vines = sum(int(row.length / options.vine_spacing) + 1 for row in out.rows)
+    if vines > _trees.MOST_PLANTS:
+        raise refused("vine_spacing", f"there would be {vines} vines; the limit is {_trees.MOST_PLANTS}")
+    _field.ground(out, field_colour="meadow")
+    for row in out.rows:
+        _trellis(site, out, row, options)
+    size = source.stream("size")
+    stood = _trees.places(out, source.stream("places"), "row", options.vine_spacing, options.jitter)
+    for row, found in zip(out.rows, stood, strict=True):
+        drawn = size.random((len(found), 3)).tolist()
+        for k, ((u, v), chance) in enumerate(zip(found, drawn, strict=True), 1):
+            _vine(site, f"vine{row.number}-{k}", out, (u, v), row, options, chance)
+    _field.network(out, _field.yard(out), aisle_speed=0.8, lane_speed=1.2)
+    return site.finish(ground="grass")
+
+
+def _trellis(site: Site, out: Field, row: Row, options: Vineyard) -> None:
+    """Posts with wires between them, and the zone that they close."""
+    site.draw(out.strip(row, options.canopy_width + 0.2), "soil")
+    step = row.length / max(1, round(row.length / options.post_spacing))
+    shapes: list[dict[str, Any]] = []
+    for u in _field.between(row, step):
+        height = options.canopy_top
+        place = [mm(u - row.low), 0.0, mm(height / 2), 0.0, 0.0, 0.0]
+        shapes.append({"type": "cylinder", "radius": 0.05, "length": mm(height), "pose": place})
+    wires = (options.canopy_base, (options.canopy_base + options.canopy_top) / 2)
+    for z in wires:
+        place = [mm(row.length / 2), 0.0, mm(z), 0.0, 0.0, 0.0]
+        shapes.append({"type": "box", "size": [mm(row.length), 0.01, 0.01], "pose": place})
+    x, y = out.at(row.low, row.v)
+    said: dict[str, Any] = {"name": f"Row {row.number}", "height": mm(options.canopy_top), "width": 0.1}
+    site.put(f"trellis{row.number}", "fence", out.line(row), shapes=shapes, pose=(x, y, 0.0, out.yaw), **said)
+    site.zone(f"row{row.number}", "keepout", out.strip(row, options.canopy_width), name=f"Row {row.number}")
+
+
+def _vine(
+    site: Site, i: str, out: Field, place: tuple[float, float], row: Row, options: Vineyard, chance: list[float]
+) -> None:
+    """A vine: a trunk, and its leaves on the wires."""
+    at = out.at(*place)
+    low, high = (
+        options.canopy_base,
+        options.canopy_base + (options.canopy_top - options.canopy_base) * (0.85 + 0.15 * chance[0]),
+    )
+    wide = options.canopy_width * (0.7 + 0.3 * chance[1])
+    along = min(options.vine_spacing, 2 * min(place[0] - row.low, row.high - place[0]) + options.vine_spacing / 2)
+    across = row.v - place[1]  # the leaves hang on the wires, wherever the trunk stands
+    shapes: list[dict[str, Any]] = [
+        {"type": "cylinder", "radius": 0.04, "length": mm(low), "pose": [0.0, 0.0, mm(low / 2), 0.0, 0.0, 0.0]},
+        {
+            "type": "box",
+            "size": [mm(along), mm(wide), mm(high - low)],
+            "pose": [0.0, mm(across), mm((low + high) / 2), 0.0, 0.0, 0.0],
+        },
+    ]
+    x, y = out.at(place[0], row.v)
+    site.put(
+        i,
+        "plant",
+        rectangle(*at, 0.0, 0.08, 0.08),
+        shapes=shapes,
+        pose=(*at, 0.0, out.yaw),
+        colour=("crown", "crown_light", "leaf")[int(3 * chance[2])],
+        seen=rectangle(x, y, out.yaw, along, wide),
+        height=mm(high),
+    )

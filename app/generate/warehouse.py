@@ -1,0 +1,218 @@
+"""Generator ``warehouse``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.derive import Notes
+from app.generate import Source, _field, _trees, generates
+from app.generate._field import Field, FieldOptions, Line, Row
+from app.generate._site import SLACK, Site, mm, rectangle, refused
+from app.model.layers import Layers
+from app.parameters import parameter
+
+WALL = 0.2
+"""Metres of a wall's thickness."""
+
+BAY = 2.8
+"""Metres from upright to upright of a rack."""
+
+PALLET = (1.2, 0.8)
+
+
+@dataclass(frozen=True, slots=True)
+class Warehouse(FieldOptions):
+    """Parameters of a warehouse."""
+
+    row_length: float | None = parameter(
+        None,
+        "longest rack; default: as long as the fence allows, 24 where there is none",
+        minimum=3.0,
+        maximum=1000.0,
+        unit="m",
+    )
+    headland: float = parameter(
+        4.0, "cross aisle between the racks' ends and the wall", minimum=1.5, maximum=50.0, unit="m"
+    )
+    yard: float = parameter(
+        8.0, "depth of the dispatch area along the longest side", minimum=6.0, maximum=50.0, unit="m"
+    )
+    docks: int = parameter(3, "loading docks in the longest side", minimum=1, maximum=50)
+    racks: int | None = parameter(
+        None, "double racks; default: as many as the fence holds, 5 without one", minimum=2, maximum=_field.MOST_ROWS
+    )
+    aisle: float = parameter(2.8, "between two racks", minimum=0.8, maximum=20.0, unit="m")
+    rack_depth: float = parameter(
+        1.0, "of one of the two racks that stand back to back", minimum=0.3, maximum=5.0, unit="m"
+    )
+    rack_height: float = parameter(5.0, "of the racks", minimum=1.0, maximum=15.0, unit="m")
+    filled: float = parameter(0.85, "share of the places on the floor that hold a pallet", minimum=0.0, maximum=1.0)
+    chargers: int = parameter(2, "charging places", minimum=1, maximum=50)
+    parking: int = parameter(2, "parking places", minimum=0, maximum=50)
+    one_way: bool = parameter(False, "whether aisles are driven one way, in turns there and back")
+    wall_height: float = parameter(7.0, "of the hall's walls", minimum=2.0, maximum=20.0, unit="m")
+
+
+@generates(
+    {"location", "objects", "occupancy", "topology", "zones", "imagery"}, parameters=Warehouse, also={"location"}
+)
+def warehouse(given: Layers, options: Warehouse, source: Source, notes: Notes) -> Layers:
+    """A warehouse: a hall with racks and pallets, aisles (one-way on request), loading docks, chargers and parking."""
+    site = Site(given, options, notes)
+    lines = [Line("row", k, f"A{k}") for k in range(1, (options.racks or _field.MOST_ROWS) + 1)]
+    out = _field.open_field(
+        site,
+        options,
+        lines,
+        own=None if options.racks else 5,
+        spacing=2 * options.rack_depth + options.aisle,
+        half=options.rack_depth,
+        word="aisle",
+        length=24.0,
+    )
+    site.draw(site.fence, "floor")
+    pallets = sum(4 * row.length / BAY for row in out.rows)
+    if pallets > _trees.MOST_PLANTS:
+        raise refused("racks", f"there would be {int(pallets)} pallets; the limit is {_trees.MOST_PLANTS}")
+    for row in out.rows:
+        _rack(site, out, row, options, source.stream(f"pallets {row.number}"))
+    _field.network(
+        out,
+        _dispatch(site, out, options),
+        aisle_speed=1.2,
+        lane_speed=1.5,
+        along="move_base",
+        change="move_base",
+        one_way=options.one_way,
+    )
+    return site.finish(ground="asphalt")
+
+
+def _rack(site: Site, out: Field, row: Row, options: Warehouse, stream: np.random.Generator) -> None:
+    """Two racks back to back, the pallets on their floor, and the zone that they close."""
+    depth, height = options.rack_depth, options.rack_height
+    bays = max(1, int(row.length / BAY))
+    bay = row.length / bays
+    shapes: list[dict[str, Any]] = []
+    for post in range(bays + 1):
+        u = min(max(post * bay, 0.05), row.length - 0.05)
+        for v in (-depth + 0.05, -0.1, 0.1, depth - 0.05):
+            place = [mm(u), mm(v), mm(height / 2), 0.0, 0.0, 0.0]
+            shapes.append({"type": "box", "size": [0.1, 0.1, mm(height)], "pose": place})
+    for level in range(1, max(1, int(height / 1.6)) + 1):
+        z = level * height / (int(height / 1.6) + 1)
+        for v in (-depth / 2, depth / 2):
+            place = [mm(row.length / 2), mm(v), mm(z), 0.0, 0.0, 0.0]
+            shapes.append({"type": "box", "size": [mm(row.length), mm(depth), 0.1], "pose": place})
+    x, y = out.at(row.low, row.v)
+    site.put(
+        f"rack{row.number}",
+        "shelf",
+        out.strip(row, 2 * depth),
+        shapes=shapes,
+        pose=(x, y, 0.0, out.yaw),
+        colour="shelf",
+        name=f"Rack {row.number}",
+        size=[mm(row.length), mm(2 * depth), mm(height)],
+        height=mm(height),
+    )
+    site.zone(f"rack{row.number}", "keepout", out.strip(row, 2 * depth), name=f"Rack {row.number}")
+    along, across = min(PALLET[0], (bay - 0.3) / 2), min(PALLET[1], depth - 0.15)
+    number = 0
+    for k in range(bays):
+        for side in (-1, 1):
+            for end in (-1, 1):
+                a, b, c = stream.random(3).tolist()
+                if a >= options.filled:
+                    continue
+                number += 1
+                u = row.low + (k + 0.5) * bay + end * (along / 2 + 0.05 + 0.05 * b)
+                size = (along, across, 0.8 + 0.6 * c)
+                spot = out.at(u, row.v + side * (depth / 2))
+                name = f"pallet{row.number}-{number}"
+                site.box(name, "crate", spot, size, yaw=out.yaw, colour="goods" if b < 0.6 else "straw")
+
+
+def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
+    """The dispatch area: doors with docks, chargers, parking places, and walls around the hall. Its nodes on the lane,
+    and their u."""
+    lane, radius = out.aisles[0], options.robot_radius
+    names = [f"Dock{k + 1}" for k in range(options.docks)]
+    names += [f"Charger{k + 1}" for k in range(options.chargers)]
+    names += [f"Parking{k + 1}" for k in range(options.parking)]
+    pitch = mm(max(3.0, 2 * radius + 1.2))
+    if (len(names) + 1) * pitch > lane.high - lane.low:
+        raise refused(
+            "docks",
+            f"{len(names)} docks, chargers and parking places need {(len(names) + 1) * pitch:g} m of the "
+            f"longest side, which has {lane.high - lane.low:.1f} m",
+        )
+    found: dict[str, float] = {}
+    doors = []
+    clear = radius + WALL + SLACK * site.resolution + 0.1
+    first = mm((lane.low + lane.high - (len(names) - 1) * pitch) / 2)
+    facing = out.yaw - math.pi / 2
+    for k, name in enumerate(names):
+        u = mm(first + k * pitch)
+        stop = f"At{name}"
+        found[stop] = u
+        site.node(stop, out.at(u, lane.v), yaw=out.yaw)
+        wall = _wall_below(out, u)
+        words: dict[str, Any] = {}
+        v = wall + clear
+        if name.startswith("Dock"):
+            doors.append(out.area(u - 1.25, wall - 0.6, u + 1.25, wall + WALL + 0.6))
+            site.mark(
+                f"door{k + 1}",
+                "door",
+                shapely.LineString([out.at(u - 1.25, wall), out.at(u + 1.25, wall)]),
+                name=f"Gate {k + 1}",
+            )
+            site.draw(out.area(u - 1.25, wall, u + 1.25, wall + 2.5), "marking")
+            site.draw(out.area(u - 1.1, wall, u + 1.1, wall + 2.35), "concrete")
+        elif name.startswith("Charger"):
+            words = {"openrmf": {"parameters": {"is_charger": [4, True], "is_parking_spot": [4, True]}}}
+            v = wall + clear + 0.5
+            site.box(
+                name.lower(),
+                "machine",
+                out.at(u, wall + WALL + 0.2),
+                (0.6, 0.3, 1.2),
+                yaw=out.yaw,
+                colour="charger",
+                name=name,
+            )
+        else:
+            words = {"openrmf": {"parameters": {"is_parking_spot": [4, True]}}}
+            site.draw(rectangle(*out.at(u, v), out.yaw, 2 * radius + 0.4, 2 * radius + 0.4), "concrete")
+        if v > lane.v - radius:
+            raise refused("yard", f"{options.yard:g} m are too few for a robot of {radius:g} m radius")
+        site.node(name, out.at(u, mm(v)), yaw=facing, **words)
+        site.way(stop, name, speed=0.5)
+    inside = shapely.buffer(site.fence, -WALL, join_style="mitre")
+    walls = shapely.difference(shapely.difference(site.fence, inside), shapely.union_all(doors))
+    for k, piece in enumerate(sorted(shapely.get_parts(walls), key=lambda p: p.bounds), 1):
+        if piece.geom_type != "Polygon" or piece.area < 1e-4:
+            continue
+        rings = [np.round(shapely.get_coordinates(r), 3).tolist()[:-1] for r in (piece.exterior, *piece.interiors)]
+        shape = {"type": "polyline", "points": rings, "height": mm(options.wall_height)}
+        said: dict[str, Any] = {"height": mm(options.wall_height), "name": f"Wall {k}"}
+        site.put(f"wall{k}", "wall", piece, shapes=[shape], pose=(0.0, 0.0, 0.0, 0.0), colour="wall", **said)
+    low, high = lane.low, lane.high
+    slow = out.area(low, 0.0, high, lane.v + 1.0)
+    if slow.geom_type == "Polygon":
+        site.zone("speed-dispatch", "speed", slow, name="Dispatch", value=0.8)
+    return found
+
+
+def _wall_below(out: Field, u: float) -> float:
+    """v of the fence below the lane at a place."""
+    whole = out.inner(0.0)
+    cut = shapely.intersection(whole, shapely.LineString([(u, whole.bounds[1] - 1), (u, out.aisles[0].v)]))
+    pieces = [p.bounds for p in shapely.get_parts(cut) if p.geom_type == "LineString"]
+    return mm(max((low for _, low, _, high in pieces if abs(high - out.aisles[0].v) < 1e-6), default=0.0))
