@@ -1,0 +1,254 @@
+"""Fields and the warehouse: rows within any fence, and everything that a site must hold to."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from app import generate
+from app.errors import CannotGenerate, Invalid
+from app.generate import _trees
+from app.model.features import Features, features
+from app.model.frame import GROUND, Datum
+from app.model.geodesy import local_frame
+from app.model.grid import FREE, OCCUPIED
+from app.model.layers import Layers, PartKey
+from app.model.meshes import load_mesh
+from tests.api.conftest import Api
+from tests.generate import looks
+
+NETWORK = PartKey("topology", GROUND, "network")
+OBJECTS = PartKey("objects", GROUND, "generated")
+SMALL: dict[str, dict[str, Any]] = {
+    "orchard": {"rows": 3, "row_length": 20},
+    "crop_rows": {"beds": 3, "row_length": 20},
+    "polytunnels": {"tunnels": 1, "rows_per_tunnel": 3, "row_length": 20},
+    "vineyard": {"rows": 3, "row_length": 20},
+    "warehouse": {"racks": 2, "row_length": 22, "docks": 2, "parking": 1},
+}
+DIGESTS = {
+    "orchard": "ed5074a86d65f66cc57c8adbc605409422637eaf99ca2cca2043b31660e497c7",
+    "crop_rows": "72771bb1c902b5ffb22255b2493695cd59bc0af0a93656aa69ba91222cb1cfde",
+    "polytunnels": "86de56fc285bed214277ccc483be3c7f0252372ed5ff4d8bb1d631f25f6f1c66",
+    "vineyard": "c2231f822dcde414287b056eb0af14ece3de13fd0ce8a590d3407b4717a3aa07",
+    "warehouse": "49d633bae2fc8a30c667530409624cc17858353178d423993b6090261b9db616",
+}
+HERE = Datum(53.2686, -0.5245, heading=12.0)
+FENCES = {
+    "slanting": [(0, 0), (44, 14), (30, 52), (-12, 36)],
+    "triangle": [(0, 0), (70, 10), (20, 55)],
+    "L": [(0, 0), (50, 0), (50, 22), (26, 22), (26, 60), (0, 60)],
+    "U": [(0, 0), (60, 0), (60, 50), (40, 50), (40, 26), (22, 26), (22, 50), (0, 50)],
+}
+
+
+def fenced(name: str) -> Layers:
+    """An environment with a datum and a fence of GNSS places."""
+    ring = local_frame(HERE).geometries_to_wgs84(np.array([shapely.Polygon(FENCES[name])], object))
+    return Layers({PartKey("location", GROUND, "site"): features([("f", ring[0], {"kind": "fence"})], "wgs84")}, HERE)
+
+
+def network(layers: Layers) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Places of the nodes, and the edges."""
+    part = layers.parts[NETWORK]
+    assert isinstance(part, Features)
+    nodes = {f.id: f.geometry for f in part if f.properties["kind"] == "node"}
+    return nodes, {f.id: dict(f.properties) for f in part if f.properties["kind"] == "edge"}
+
+
+@pytest.mark.parametrize("name", sorted(SMALL))
+def test_a_site_agrees_with_itself_and_every_format_serves_from_it(name: str, tmp_path: Path) -> None:
+    made, notes = looks.make(name, **SMALL[name])
+    assert not notes.dropped
+    assert [t["what"] for t in notes.template] == ["datum"]
+    looks.agrees_with_itself(made, 0.3)
+    looks.sound_sdf(made, tmp_path)
+    looks.serves(made)
+    assert looks.digest(made) == DIGESTS[name]
+    other, _ = looks.make(name, 8, **SMALL[name])
+    assert looks.digest(other) != DIGESTS[name]
+    assert network(other)[1].keys() == network(made)[1].keys(), "chance moves plants, not ways"
+
+
+@pytest.mark.parametrize(("name", "fence"), list(zip(sorted(SMALL), itertools.cycle(FENCES), strict=False)))
+def test_rows_keep_within_any_fence_along_its_longest_side(name: str, fence: str) -> None:
+    given = fenced(fence)
+    made, _ = looks.make(name, given=given)
+    assert made.datum == HERE
+    looks.agrees_with_itself(Layers({**given.parts, **made.parts}, made.datum, made.levels), 0.3)
+    whole = shapely.Polygon(FENCES[fence]).buffer(0.002)
+    for part in (*made.vector("objects").values(), *made.vector("topology").values(), *made.vector("zones").values()):
+        assert shapely.contains(whole, part.geometry).all()
+    nodes, edges = network(made)
+    sides = [(math.dist(a, b), a, b) for a, b in itertools.pairwise([*FENCES[fence], FENCES[fence][0]])]
+    _, a, b = max(sides)
+    along = math.atan2(b[1] - a[1], b[0] - a[0])
+    rows = [e for e in edges.values() if e["action"] == "row_traversal" or e["source"].startswith("A1-")]
+    assert len(rows) > 10
+    for edge in rows[:20]:
+        if edge["source"][:3] == edge["target"][:3]:
+            p, q = nodes[edge["source"]], nodes[edge["target"]]
+            assert math.sin(math.atan2(q.y - p.y, q.x - p.x) - along) == pytest.approx(0, abs=0.01)
+
+
+def test_the_network_is_called_as_in_real_polytunnels() -> None:
+    made, _ = looks.make("polytunnels", tunnels=2, rows_per_tunnel=5, row_length=16)
+    nodes, edges = network(made)
+    aisles = {n.rpartition("-")[0] for n in nodes if n.startswith("r")}
+    between = ["r0.7", "r1.5", "r2.5", "r3.5", "r4.5", "r5.3", "r5.7", "r6.5", "r7.5", "r8.5", "r9.5", "r10.3"]
+    assert aisles == set(between), "as in Riseholme's two tunnels"
+    assert {n.partition("-")[2] for n in nodes if n.startswith("r")} == {
+        "ca",
+        "cb",
+        *(f"c{k}" for k in range(4)),
+        "cy",
+        "cz",
+    }
+    assert nodes["r1.5-ca"].distance(nodes["r2.5-ca"]) == pytest.approx(1.35)
+    count = Counter(e["action"] for e in edges.values())
+    assert count["row_traversal"] == 12 * 7 * 2
+    assert count["row_change"] == 11 * 2 * 2
+    assert edges["r5.3-ca_r5.7-ca"]["action"] == "row_change"
+    assert edges["LaneWest_r0.7-ca"]["action"] == "move_base"
+    objects = made.parts[OBJECTS]
+    assert isinstance(objects, Features)
+    kinds = Counter(p["kind"] for p in objects.properties)
+    assert (kinds["table"], kinds["tunnel"], kinds["post"]) == (10, 2, 3), "two tunnels share the legs between them"
+    (grid,) = made.grids().values()
+    table = objects.geometry[objects.index()["table1"]]
+    x, y = shapely.centroid(table).x + 1.2, shapely.centroid(table).y
+    assert grid.cells[int((y - grid.origin[1]) / 0.05), int((x - grid.origin[0]) / 0.05)] == FREE, "between its legs"
+    (zones,) = made.vector("zones").values()
+    assert {i for i in zones.ids if i.startswith("row")} == {f"row{k}" for k in range(1, 11)}
+
+
+def test_trees_stand_where_they_were_asked_for() -> None:
+    asked = {"rows": 3, "row_length": 18, "row_spacing": 5.0, "tree_spacing": 3.0, "jitter": 0.2}
+    made, _ = looks.make("orchard", **asked)
+    part = made.parts[OBJECTS]
+    assert isinstance(part, Features)
+    trees = [f for f in part if f.properties["kind"] == "tree"]
+    assert len(trees) == 3 * 7
+    lines = {f.properties["name"]: f.geometry for f in part if f.properties["kind"] == "tree_row"}
+    assert lines["Row 1"].distance(lines["Row 2"]) == pytest.approx(5.0)
+    off = [lines[f"Row {f.id[4]}"].distance(f.geometry) for f in trees]
+    assert 0.05 < max(off) <= 0.2
+    (grid,) = made.grids().values()
+    for tree in trees:
+        x, y = tree.properties["pose"][:2]
+        assert grid.cells[int((y - grid.origin[1]) / 0.05), int((x - grid.origin[0]) / 0.05)] == OCCUPIED
+    still, _ = looks.make("orchard", **{**asked, "jitter": 0})
+    rows = still.parts[OBJECTS]
+    assert isinstance(rows, Features)
+    x = [f.geometry.x for f in rows if f.id.startswith("tree1-")]
+    assert np.diff(x) == pytest.approx(3.0)
+
+
+def test_the_crown_is_a_closed_ball() -> None:
+    vertices, faces = load_mesh(_trees.crown_mesh(), "crown.stl")
+    corners = vertices[faces]
+    assert len(faces) == 80
+    assert np.linalg.norm(vertices, axis=1) == pytest.approx(1.0, abs=1e-5)
+    volume = np.einsum("ij,ij->i", np.cross(corners[:, 0], corners[:, 1]), corners[:, 2]).sum() / 6
+    assert 3.6 < volume < 4 / 3 * math.pi, "its sides look outwards"
+
+
+def test_one_way_aisles_go_there_and_back() -> None:
+    values = {**SMALL["warehouse"], "racks": 4}
+    plain, _ = looks.make("warehouse", **values)
+    made, _ = looks.make("warehouse", one_way=True, **values)
+    looks.agrees_with_itself(made, 0.3)
+    edges = network(made)[1]
+    assert {f"A{k}-ca_A{k}-cb" in edges for k in (1, 3)} == {True}
+    assert "A1-cb_A1-ca" not in edges
+    assert "A2-cb_A2-ca" in edges
+    assert "A2-ca_A2-cb" not in edges
+    aisles = [e for e in edges.values() if re.match(r"A\d-", e["source"]) and e["source"][:3] == e["target"][:3]]
+    before = network(plain)[1]
+    assert len(before) - len(edges) == len(aisles)
+    nodes, _ = network(made)
+    assert {"Dock1", "Dock2", "Charger1", "Charger2", "Parking1"} <= set(nodes)
+    part = made.parts[NETWORK]
+    assert isinstance(part, Features)
+    charger = part.properties[part.index()["Charger1"]]
+    assert charger["openrmf"]["parameters"]["is_charger"] == [4, True]
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "why"),
+    [
+        ("orchard", {"rows": 0}, "at least 2"),
+        ("orchard", {"rows": 10**9}, "at most 500"),
+        ("orchard", {"row_spacing": "wide"}, "must be a number"),
+        ("orchard", {"colour": "red"}, "no such parameter of orchard"),
+        ("orchard", {"robot_radius": 1.7}, r"row_spacing: 3.60 m .* at least 3.91 m are needed"),
+        ("orchard", {"headland": 1.5, "robot_radius": 0.8}, "headland: 1.5 m are too few to turn"),
+        ("orchard", {"crown_diameter": 0.3, "trunk_diameter": 0.5}, "no thinner than its trunk"),
+        ("orchard", {"rows": 500, "row_length": 1000, "tree_spacing": 0.5, "resolution": 1}, "row_spacing|trees"),
+        ("orchard", {"row_length": 500, "rows": 200, "resolution": 0.01}, "resolution: .* ask for a coarser"),
+        ("orchard", {"docks": 20, "row_length": 10}, "docks: the lane of 15"),
+        ("orchard", {"datum": "95,0"}, "datum latitude must be between"),
+        ("crop_rows", {"aisle": 0.5}, "aisle: 1.30 m from row to row"),
+        ("crop_rows", {"plant_spacing": 0.05, "row_length": 300, "beds": 20}, "plant_spacing: there would be"),
+        ("polytunnels", {"tunnel_height": 2, "side_height": 3}, "must be above side_height"),
+        (
+            "polytunnels",
+            {"tunnels": 40, "row_length": 800, "hoop_spacing": 0.5, "node_spacing": 90},
+            "hoop_spacing: there",
+        ),
+        ("vineyard", {"canopy_base": 2, "canopy_top": 1}, "must be above canopy_base"),
+        ("vineyard", {"rows": 100, "row_length": 700}, "node_spacing: there would be"),
+        ("warehouse", {"docks": 30}, "docks: 34 docks, chargers and parking places need 105 m"),
+        ("warehouse", {"robot_radius": 1.5}, "aisle: 4.80 m from row to row"),
+    ],
+)
+def test_what_cannot_be_made_is_told_before_any_work(name: str, values: dict[str, Any], why: str) -> None:
+    with pytest.raises((CannotGenerate, Invalid), match=why):
+        looks.make(name, **values)
+
+
+def test_a_fence_that_holds_nothing_is_told() -> None:
+    key = PartKey("location", GROUND, "site")
+    for size, why in (((9, 9), "yard: the fence has no lane"), ((4, 60), "holds no field|no lane")):
+        small = features([("f", shapely.box(0, 0, *size), {"kind": "fence"})], "local")
+        for name in SMALL:
+            with pytest.raises(CannotGenerate, match=f"{why}|the fence holds no row"):
+                generate.run(name, 1, {}, Layers({key: small}, HERE), looks.Notes())
+
+
+def test_large_fields_take_cells_that_still_show_the_ways() -> None:
+    big = features([("f", shapely.box(0, 0, 120, 100), {"kind": "fence"})], "local")
+    made, notes = looks.make("vineyard", given=Layers({PartKey("location", GROUND, "site"): big}, HERE), vine_spacing=6)
+    (grid,) = made.grids().values()
+    assert grid.resolution == 0.1
+    assert [t["what"] for t in notes.template] == ["resolution"]
+
+
+def test_over_http_and_edits(api: Api) -> None:
+    wanted = ("gazebo", "occupancy_grid", "tmap2", "kml", "osm", "satellite", "openrmf")
+    version = looks.over_http(api, "polytunnels", wanted, **SMALL["polytunnels"])
+    assert set(version["information"].values()) >= {"generated"}
+    env = "environments/made-polytunnels"
+    before = api.get(f"{env}/versions/latest/layers/location").json()
+    body = {"generator": "warehouse", "seed": 1, "parameters": SMALL["warehouse"]}
+    api.post(f"{env}/generations", body)
+    after = api.get(f"{env}/versions/latest/layers/location").json()
+    assert after["features"], "the new site has its fence"
+    assert after["features"] != before["features"], "the old site's fence does not bind the new one"
+    world = api.get("/maps/made-polytunnels/gazebo").content
+    assert b"walls_map" not in world, "the grid is a slice of the objects"
+    ring = [[5, 5], [6, 5], [6, 6], [5, 6], [5, 5]]
+    change = {"op": "cells", "grid": "map", "polygon": {"type": "Polygon", "coordinates": [ring]}, "crs": "local"}
+    api.post(f"{env}/edits", {"changes": [{**change, "value": 100}]})
+    world = api.get("/maps/made-polytunnels/gazebo").content
+    assert b"walls_map" in world, "people have drawn in it"
+    told = api.problem("POST", f"{env}/generations", 422, json={**body, "parameters": {"racks": 1}})
+    assert "racks" in told["detail"]
