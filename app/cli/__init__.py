@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from app import __version__
-from app.cli import agent, generate, history, maps, output, serving, templates, tokens
+from app.cli import agent, align, generate, history, maps, output, serving, templates, tokens
 from app.cli.client import Refused
 from app.errors import FleetMapError
 
@@ -96,6 +96,7 @@ def build(*, all_flags: bool = True) -> typer.Typer:
         ("promote", history.promote),
         ("revert", history.revert),
         ("derive", history.derive),
+        ("align", align.align),
         ("generate", generate.generate),
         ("template", templates.template),
         ("agent", agent.agent),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
 
 from app.cli import options, output
-from app.cli.client import Client, path_of
+from app.cli.client import Client, Refused, path_of
 
 Environment = Annotated[str, typer.Argument(help="Name of the environment.")]
 
@@ -219,6 +220,26 @@ def _environments(limit: int, server: str | None, token: str | None, *, as_json:
     )
 
 
+def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
+    """What the named server can compute, or where none is named, or none answers, what any can."""
+    from app.api.derivations import as_dict
+    from app.derive import all_derivations
+
+    named = server or os.environ.get("FLEETMAP_SERVER")
+    why = "no server is named"
+    if named:
+        try:
+            with Client(server, token) as client:
+                rows: list[dict[str, Any]] = client.get("/derivations")
+                return rows
+        except Refused as refused:
+            if refused.status is not None:
+                raise
+            why = str(refused)
+    output.say(f"{why}: a server with a provider of pictures has location_to_imagery, too")
+    return [as_dict(d) for d in all_derivations().values()]
+
+
 def _minute(time: Any) -> str:
     """RFC 3339 as the API tells it (UTC), to the minute: ``2026-05-01 08:30``."""
     return str(time or "")[:16].replace("T", " ")
@@ -246,13 +267,10 @@ def derive(
 ) -> None:
     """Compute a layer from others and keep it as a version; without names, list the ways.
 
-    The list needs no server.
+    The list is the server's, where one is named (by --server or FLEETMAP_SERVER) and answers; else it needs none.
     """
     if environment is None:
-        from app.api.derivations import as_dict
-        from app.derive import all_derivations
-
-        known = [as_dict(d) for d in all_derivations().values()]
+        known = _derivations(server, token)
         if as_json:
             output.show_json(known)
             return

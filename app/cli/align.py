@@ -1,0 +1,110 @@
+"""``fleetmap align``: a stored grid laid onto another map of its environment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import typer
+
+from app.cli import options, output
+from app.cli.client import Client, path_of
+from app.errors import Invalid
+
+
+def align(
+    environment: Annotated[str, typer.Argument(help="Name of the environment.")],
+    onto: Annotated[
+        str | None,
+        typer.Argument(help="What it is laid onto: objects, voxels, or the name of another grid; or give --pair."),
+    ] = None,
+    grid: Annotated[str, typer.Option("--grid", help="The grid that is moved.")] = "map",
+    level: options.Level = "ground",
+    onto_level: Annotated[
+        str | None, typer.Option("--onto-level", help="The storey of what it is laid onto [default: the grid's].")
+    ] = None,
+    pair: Annotated[
+        list[str] | None,
+        typer.Option("--pair", metavar="X,Y=X,Y", help="A point where it is, and where it should be, m; repeatable."),
+    ] = None,
+    option: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--option", "-O", metavar="NAME=VALUE", help="Of the slice of objects or voxels (height …); repeatable."
+        ),
+    ] = None,
+    angle: Annotated[float, typer.Option("--angle", min=0, max=180, help="The largest turn that is tried, °.")] = 180.0,
+    reach: Annotated[
+        float | None, typer.Option("--reach", min=0, help="The farthest that the grid's middle may go, m.")
+    ] = None,
+    near: Annotated[
+        float | None,
+        typer.Option("--near", help="What agrees, m: cells [default: 0.1] or points [default: 0.5] this near."),
+    ] = None,
+    least: Annotated[float, typer.Option("--least", min=0, max=1, help="The share that has to agree.")] = 0.5,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what is found.")] = False,
+    message: options.Message = "",
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Find where a grid lies on another map, tell how well it fits, and put it there as a version.
+
+    Its origin changes, its cells do not: `fleetmap export … occupancy_grid -O normalize=true` bakes a turn into cells.
+    """
+    body: dict[str, Any] = {"grid": grid, "level": level, "angle": angle, "reach": reach, "near": near}
+    body |= {"least": least, "dry_run": dry_run, "message": message}
+    if (onto is None) == (not pair):
+        raise typer.BadParameter("name what the grid is laid onto (objects, voxels, another grid), or give --pair")
+    if pair:
+        if option or onto_level is not None:
+            raise typer.BadParameter("--option and --onto-level belong to a map, not to points")
+        body["pairs"] = [_pair(text) for text in pair]
+    else:
+        layer = onto if onto in ("objects", "voxels") else "occupancy"
+        if option and layer == "occupancy":
+            raise typer.BadParameter("--option belongs to objects and voxels: a stored grid has no parameters")
+        target: dict[str, Any] = {"layer": layer, "level": onto_level or level, "parameters": options.pairs(option)}
+        body["onto"] = target if layer != "occupancy" else {**target, "name": onto}
+    with Client(server, token) as client, output.progress_bar("aligning"):
+        made = client.post(path_of("environments", environment, "alignments"), body, repeat=True)
+    if as_json:
+        output.show_json(made)
+        return
+    _show(environment, made)
+
+
+def _show(environment: str, made: Mapping[str, Any]) -> None:
+    found, version = made.get("alignment") or {}, made.get("version")
+    if found:
+        where = found.get("grid") or {}
+        turn = math.degrees(float(found["yaw"]))
+        moved = f"turned by {turn:.3f}°, moved by {float(found['x']):.3f}, {float(found['y']):.3f} m"
+        output.show(f"{environment}: {where.get('level')}/{where.get('name')} {moved}")
+        shares = [f"residual {float(found['residual']):.3f} m", f"agreement {float(found['agreement']):.1%}"]
+        if found.get("overlap") is not None:
+            shares.append(f"overlap {float(found['overlap']):.1%}")
+        output.show(f"  {', '.join(shares)}")
+        output.show(f"  origin {_place(found['before'])} → {_place(found['origin'])}")
+        for other in found.get("others") or ():
+            turn = math.degrees(float(other["yaw"]))
+            output.show(f"  also possible: {turn:.3f}°, {other['x']:.3f}, {other['y']:.3f} m: {other['agreement']:.1%}")
+    output.show(f"  version {version['version']}" if version else "  nothing is stored")
+    output.show_warnings(made.get("warnings") or ())
+
+
+def _place(origin: Any) -> str:
+    x, y, yaw = (float(v) for v in origin)
+    return f"({x:.3f}, {y:.3f}, {math.degrees(yaw):.3f}°)"
+
+
+def _pair(text: str) -> list[list[float]]:
+    """``X,Y=X,Y`` as two points; Invalid for anything else."""
+    try:
+        (a, b), (c, d) = ([float(n) for n in point.split(",")] for point in text.split("="))
+    except ValueError:
+        raise Invalid(f"--pair needs X,Y=X,Y in metres, got {text!r}") from None
+    if not all(math.isfinite(n) for n in (a, b, c, d)):
+        raise Invalid(f"--pair needs finite numbers, got {text!r}")
+    return [[a, b], [c, d]]

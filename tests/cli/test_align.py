@@ -1,0 +1,116 @@
+"""``fleetmap align`` against a running server, and which derivations are listed."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from tests.api.test_alignments import files
+from tests.cli.conftest import Fleetmap
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("maps")
+    for name, origin in (("map", [-3.0, 2.0, 0.0]), ("other", [4.0, -1.0, 0.3])):
+        for file, data in files(name, origin).items():
+            (folder / file).write_bytes(data)
+    return folder
+
+
+def hall(fleetmap: Fleetmap, maps: Path, name: str) -> None:
+    for grid in ("map", "other"):
+        told = fleetmap("import", maps / f"{grid}.yaml", maps / f"{grid}.png", "-e", name, "--grid", grid)
+        assert told.status == 0, told.err
+
+
+def test_a_grid_is_laid_onto_another(fleetmap: Fleetmap, maps: Path) -> None:
+    hall(fleetmap, maps, "halls")
+    told = fleetmap("align", "halls", "map", "--grid", "other", "--dry-run")
+    assert told.status == 0, told.err
+    assert "halls: ground/other turned by -17." in told.out
+    assert "residual 0.0" in told.out
+    assert "agreement 100.0%" in told.out
+    assert "origin (4.000, -1.000, 17.189°) → (-3.0" in told.out
+    assert "nothing is stored" in told.out
+    found = fleetmap("align", "halls", "map", "--grid", "other", "-m", "by its walls", "--json").json
+    assert found["version"]["message"] == "by its walls"
+    assert found["alignment"]["yaw"] == pytest.approx(-0.3, abs=math.radians(0.2))
+    assert found["alignment"]["residual"] < 0.1
+    assert found["alignment"]["origin"][:2] == pytest.approx([-3.0, 2.0], abs=0.05)
+    again = fleetmap("align", "halls", "map", "--grid", "other")
+    assert again.status == 0
+    assert "turned by 0.0" in again.out.replace("-0.0", "0.0"), "it lies there already"
+    assert "keep their place" in again.err
+
+
+def test_by_points(fleetmap: Fleetmap, maps: Path) -> None:
+    hall(fleetmap, maps, "points")
+    pairs = ("--pair", "4,-1=0,0", "--pair", "5,-1=1,0", "--pair", "4,3=0,4", "--pair", "0,0=9,9")
+    told = fleetmap("align", "points", "--grid", "other", *pairs)
+    assert told.status == 0, told.err
+    assert "moved by -4.000, 1.000 m" in told.out
+    assert "1 pairs disagree" in told.err
+    refused = fleetmap("align", "points", "--grid", "other", *pairs, "--least", "0.9")
+    assert refused.status == 1
+    assert "do not fit" in refused.err
+
+
+def test_onto_a_slice_of_objects_and_what_is_refused(fleetmap: Fleetmap, maps: Path, tmp_path: Path) -> None:
+    hall(fleetmap, maps, "sliced")
+    lines = ["[-3,2.05],[9,2.05]", "[-3,9.95],[9,9.95]", "[-2.95,2],[-2.95,10]", "[8.95,2],[8.95,10]",
+             "[1.05,2],[1.05,7]", "[1,7.05],[4,7.05]"]  # fmt: skip
+    walls = [
+        {
+            "type": "Feature",
+            "properties": {"kind": "wall"},
+            "geometry": None,
+            "place": {"type": "LineString", "coordinates": json.loads(f"[{line}]")},
+        }
+        for line in lines
+    ]
+    crs = "http://www.opengis.net/def/crs/OGC/0/Engineering2D"
+    (tmp_path / "walls.geojson").write_text(
+        json.dumps({"type": "FeatureCollection", "coordRefSys": crs, "features": walls})
+    )
+    assert fleetmap("import", tmp_path / "walls.geojson", "-e", "sliced").status == 0
+    slice_ = ("objects", "--grid", "other", "-O", "resolution=0.1", "--near", "0.15", "--dry-run")
+    told = fleetmap("align", "sliced", *slice_, "--json")
+    assert told.json["alignment"]["origin"] == pytest.approx([-3.0, 2.0, 0.0], abs=0.1)
+    assert fleetmap("align", "sliced", *slice_, "-O", "colour=1").status == 1
+    for wrong, says in (
+        ((), "name what the grid is laid onto"),
+        (("map", "--pair", "0,0=1,1"), "or give --pair"),
+        (("map", "-O", "height=1"), "a stored grid has no parameters"),
+        (("--pair", "0,0=1,1", "-O", "height=1"), "not to points"),
+        (("map", "--angle", "400"), "less than or equal to 180"),
+    ):
+        refused = fleetmap("align", "sliced", *wrong)
+        assert refused.status == 2, wrong
+        assert says in " ".join(refused.err.replace("│", " ").split()), wrong
+    for text in ("0,0", "0,0=1", "a,b=c,d", "0,0=nan,1", "0,0=1,1=2,2"):
+        refused = fleetmap("align", "sliced", "--pair", text)
+        assert refused.status == 1
+        assert "--pair needs" in refused.err
+    assert "stored grids" in fleetmap("align", "sliced", "map", "--grid", "moon").err
+
+
+def test_the_list_is_the_servers(fleetmap: Fleetmap, offline: Fleetmap, monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = fleetmap("derive", "--json")
+    assert listed.status == 0
+    assert "location_to_imagery" not in {row["id"] for row in listed.json}, "this server has no provider"
+    assert "location_to_imagery" not in listed.err
+    monkeypatch.setattr("app.cli.client.TRIES", 1)
+    absent = fleetmap("derive", "--json", "--server", "http://127.0.0.1:9")
+    assert absent.json == listed.json
+    assert "no answer from http://127.0.0.1:9" in absent.err
+    assert "location_to_imagery" in absent.err
+    monkeypatch.delenv("FLEETMAP_SERVER")
+    alone = offline("derive")
+    assert "occupancy_to_topology" in alone.out
+    assert "no server is named" in alone.err
+    monkeypatch.setenv("FLEETMAP_TOKEN", "wrong")
+    assert fleetmap("derive", "--server", "http://127.0.0.1:9").status == 0
