@@ -237,8 +237,12 @@ def _forced(
             continue
         less = replace(available, keys=frozenset(k for k in available.keys if k.layer != step.gives))
         rivals = frozenset(n for n, d in everything.items() if d.gives == step.gives and n != name)
-        way = _best(known, less, without | rivals)
-        if way is not None and any(s.name == name for s in way.steps):
+        # Only by what the step gives: a format that a grid alone is enough for would do without its objects.
+        wishes = [wanted for wanted in known.needs.one_of if step.gives in wanted]
+        ways = [way for wanted in wishes if (way := derive.plan(less.layers, wanted, without | rivals)) is not None]
+        ways = [way for way in ways if any(s.name == name for s in way.steps)]
+        if ways:
+            way = min(ways, key=lambda one: one.cost)
             found.append((way.cost, name, less, way))
     if found:
         _, _, less, way = min(found, key=lambda f: f[:2])

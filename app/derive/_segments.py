@@ -210,8 +210,10 @@ def _by_index(ground: Ground, nir: int | None, notes: Notes, name: str) -> NDArr
         index, least = (2 * rgb[..., 1] - rgb[..., 0] - rgb[..., 2]) / total, GREEN
     else:
         infrared, red = ground.raw[..., nir].astype(np.float64), _red(ground)
-        total = infrared + red
-        index = np.divide(infrared - red, total, out=np.zeros(total.shape), where=total > 0).astype(np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is no number, or beyond them, does not grow
+            total = infrared + red
+            index = np.divide(infrared - red, total, out=np.zeros(total.shape), where=total > 0)
+        index = np.clip(np.nan_to_num(index, nan=0.0), -1.0, 1.0).astype(np.float32)
         least = NDVI
     index = cv2.GaussianBlur(np.where(ground.known, index, np.float32(0)).astype(np.float32), (3, 3), 0)
     known = index[ground.known]

@@ -177,7 +177,8 @@ def _opacity(values: NDArray[Any], colour: str) -> NDArray[np.uint8]:
     if values.dtype == np.uint8:
         return values
     most = float(np.iinfo(values.dtype).max) if values.dtype.kind in "iu" else 1.0
-    return np.clip(np.round(values.astype(np.float64) * (255.0 / most)), 0, 255).astype(np.uint8)
+    shares = np.clip(np.nan_to_num(values.astype(np.float64) / most, nan=0.0), 0.0, 1.0)  # no number is no picture
+    return np.round(shares * 255.0).astype(np.uint8)
 
 
 def _palette(picture: Picture) -> NDArray[np.uint8] | None:

@@ -121,6 +121,8 @@ def provider() -> Iterator[Misbehaving]:
                     self.send(200, picture_for(self.path.replace("/moved", "")))
                 elif mood == "forbidden":
                     self.send(403, b"{}", "application/json")
+                elif mood == "failing":
+                    self.send(500, b"oops", "text/plain")
                 elif mood in ("broken", "busy"):
                     self.send(503, b"", Retry_After="0")
                 elif mood == "html":
@@ -255,6 +257,7 @@ def test_rows_from_below_and_wmts_names() -> None:
     [
         ("forbidden", CannotDerive, r"refuses \(403\)"),
         ("broken", Unavailable, "answers 503"),
+        ("failing", Unavailable, "answers 500"),
         ("html", CannotDerive, "sends 'text/html'"),
         ("disguised", CannotDerive, "neither PNG nor JPEG"),
         ("huge", CannotDerive, "FLEETMAP_IMAGERY_MAX_BYTES"),
@@ -365,6 +368,7 @@ def serving(folder: Path, at: Misbehaving) -> Iterator[Api]:
         "imagery_token": SECRET,
         "imagery_attribution": "© Somebody; © Else",
         "imagery_tries": 1,
+        "imagery_seconds": 2.0,
         "imagery_cache_bytes": 0,
     }
     with running(settings_for(folder, **more)) as api:
@@ -418,10 +422,14 @@ def test_a_site_gets_its_picture(provider: Misbehaving, tmp_path: Path) -> None:
         again = api.post(path, wish).json()
         assert (again["version"], again["root"], again["stale"]) == (later["version"] + 1, later["root"], [])
         # What a provider does wrong makes no version.
-        for mood, status in (("broken", 503), ("html", 422), ("forbidden", 422), ("bomb", 422)):
+        for mood, status in (
+            *(("broken", 503), ("failing", 503), ("silent", 503), ("dripping", 503)),
+            *(("html", 422), ("forbidden", 422), ("bomb", 422), ("huge", 422), ("endless", 422)),
+        ):
             provider.mood = mood
             problem = api.problem("POST", path, status, json=wish)
             assert SECRET not in str(problem)
+            assert len(problem["detail"]) > 20
         before = api.get("environments/farm/versions/latest").json()["version"]
         provider.mood = "fine"
         api.problem("POST", path, 422, json={**wish, "parameters": {"zoom": 3}})

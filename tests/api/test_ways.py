@@ -118,7 +118,11 @@ def test_over_http(api: Api) -> None:
     line = next(line for line in report["layers"] if line["layer"] == "topology")
     assert line["steps"][0]["parameters"] == {"join": 0.1, "outlines": True}
     assert api.get("/maps/beds/tmap2?outlines=perhaps", expect=None).status_code == 422
-    assert api.get("/maps/beds/kml?outlines=true", expect=None).status_code == 422, "no step on the way takes it"
+    report = api.get("environments/beds/versions/1/reports/kml").json()
+    assert "topology" not in {line["layer"] for line in report["layers"]}
+    report = api.get("environments/beds/versions/1/reports/kml?outlines=true").json()
+    assert {"objects", "topology"} <= {line["layer"] for line in report["layers"]}, "a network was asked for"
+    assert api.get("/maps/beds/datum?outlines=true", expect=None).status_code == 422, "no step on the way takes it"
     table = {row["format"]: row for row in api.get("environments/beds/versions/1/maps").json()}
     assert table["tmap2"]["state"] in ("missing", "derivable")
 
@@ -142,3 +146,30 @@ def test_of_several_grids_one_has_to_be_named(api: Api) -> None:
     refused = api.get("/maps/two-grids/tmap2", 409)
     assert refused.json()["detail"] == rows["tmap2"]["choose"]
     assert b"- meta:" in api.get("/maps/two-grids/tmap2?grid=fine").content
+
+
+def test_a_grid_alone_becomes_a_world_of_objects_where_their_context_is_told(api: Api) -> None:
+    """Its cells are walls by default, which needs no derivation; a parameter of one asks for it."""
+    cells = np.full((60, 80), 254, np.uint8)
+    y, x = np.mgrid[:60, :80]
+    for cx, cy in ((20, 20), (60, 30)):
+        cells[(x - cx) ** 2 + (y - cy) ** 2 <= 16] = 0
+    described = b"image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\n"
+    api.post("environments", {"name": "copse"})
+    grid = {"map.yaml": described + b"free_thresh: 0.196\n", "map.pgm": b"P5 80 60 255\n" + cells.tobytes()}
+    api.upload("copse", grid)
+    row = next(r for r in api.get("environments/copse/versions/1/maps").json() if r["format"] == "gazebo")
+    assert (row["state"], row["chain"]) == ("direct", [])
+    assert b"<cylinder>" not in api.get("environments/copse/versions/1/maps/gazebo/world.sdf").content
+    world = api.get("environments/copse/versions/1/maps/gazebo/world.sdf?context=forest").content
+    assert world.count(b"<model name='tree") + world.count(b'<model name="tree') == 2, world.decode()[:2000]
+    assert b"<cylinder>" in world
+    assert b"<mesh>" not in world, "the cells' walls would stand there twice"
+    report = api.get("environments/copse/versions/1/reports/gazebo?context=forest").json()
+    (line,) = [entry for entry in report["layers"] if entry["layer"] == "objects"]
+    assert line["steps"][0]["step"] == "occupancy_to_objects"
+    assert line["steps"][0]["parameters"]["context"] == "forest"
+    wrong = api.problem("GET", "environments/copse/versions/1/maps/gazebo?context=moon", 422)
+    assert "forest" in wrong["detail"]
+    wrong = api.problem("GET", "environments/copse/versions/1/maps/gazebo?contexts=forest", 422)
+    assert "context" in wrong["detail"], "what is accepted is told"
