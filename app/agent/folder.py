@@ -235,8 +235,19 @@ TEMPLATE: Sequence[tuple[str, str, Sequence[str]]] = (
 """environment_template's variables: name, format, file names in the order of preference."""
 
 
+PLACE: Sequence[str] = (
+    "ENVIRONMENT_COMMON_LATEST_RELEASE",
+    "ENVIRONMENT_ORIGINS",
+    "FARM_NAME",
+    "FIELD_NAME",
+    "FIELD_ID",
+    "FIELD_TYPE",
+)
+"""What the template calls the place by."""
+
+
 def environment_sh(manifest: Manifest, current: Path) -> str:
-    """``environment.sh``: the environment_template's variables for the files that are there.
+    """``environment.sh``: the environment_template's variables for the files that are there, and the place's own ones.
 
     As in the template a variable is empty where its file is absent, so that sourcing it again leaves nothing stale. All
     values are literals in single quotes: whoever names a file does not run anything.
@@ -256,6 +267,8 @@ def environment_sh(manifest: Manifest, current: Path) -> str:
     for variable, ending in (("POI_FILE", "poi.kml"), ("PROPERTIES_FILE", "properties.sh")):
         found = next((file.path for file in manifest.files if file.path.rpartition("/")[2] == ending), None)
         values[variable] = str(current / found) if found else ""
+    place = {**dict.fromkeys(PLACE, ""), **manifest.variables}
+    values |= {name: value for name, value in place.items() if name not in (*values, "GAZEBO_MODEL_PATH")}
     values |= {
         "FLEETMAP_ENVIRONMENT": manifest.environment,
         "FLEETMAP_VERSION": str(manifest.version),

@@ -13,7 +13,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -26,9 +26,15 @@ CLOCKS_DIFFER = timedelta(seconds=60)
 """How far a robot's clock may be from the server's."""
 
 MAX_FILES = 100_000
+MAX_VARIABLES = 2000
 _HASH = re.compile(r"[0-9a-f]{64}")
 _FORMAT = re.compile(r"[a-z0-9][a-z0-9_]{0,62}")
 _KEY_ID = re.compile(r"[0-9a-f]{16}")
+_VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
+_FORBIDDEN = re.compile(
+    r"PATH|ENV|IFS|HOME|SHELL|(LD|DYLD|BASH|GIT|SSH|FLEETMAP)_\w*|PYTHON\w*|\w*_PRELOAD|\w*LIBRARY_PATH"
+)
+"""The server leaves these out, and more; a robot does not even believe a signature on them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +54,10 @@ class File:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """A signed list of a version's files. data, signature: the signed bytes and the header, as they came."""
+    """A signed list of a version's files. data, signature: the signed bytes and the header, as they came.
+
+    variables: what the place is called (``FARM_NAME`` …), for who sources ``environment.sh``.
+    """
 
     environment: str
     channel: str | None
@@ -59,6 +68,7 @@ class Manifest:
     files: tuple[File, ...]
     data: bytes
     signature: str
+    variables: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def content(self) -> dict[str, str]:
@@ -82,6 +92,7 @@ def parse(data: bytes, signature: str) -> Manifest:
             files,
             data,
             signature,
+            dict(body.get("variables", {})),
         )
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise Untrusted(f"the server's manifest cannot be read: {type(error).__name__}: {error}") from None
@@ -91,7 +102,18 @@ def parse(data: bytes, signature: str) -> Manifest:
     if not (whole and hashes) or expires.tzinfo is None or len(files) > MAX_FILES:
         raise Untrusted("the server's manifest cannot be read: a number, a hash or the time of expiry is none")
     _check_paths(files)
+    _check_variables(found.variables)
     return found
+
+
+def _check_variables(variables: Mapping[str, str]) -> None:
+    """Names that a shell takes, texts in one line, and nothing that changes how the robot's own programs run."""
+    if len(variables) > MAX_VARIABLES:
+        raise Untrusted(f"the manifest has {len(variables)} variables, more than {MAX_VARIABLES}")
+    for name, value in variables.items():
+        fine = _VARIABLE.fullmatch(name) and isinstance(value, str) and (value.isprintable() or not value)
+        if not fine or _FORBIDDEN.fullmatch(name):
+            raise Untrusted(f"the manifest has a variable that is not handed on to a robot: {name[:80]!r}")
 
 
 def _check_paths(files: Sequence[File]) -> None:

@@ -99,6 +99,9 @@ async def get_manifest(
         "expires": rfc3339(datetime.fromtimestamp(expires, UTC)),
         "files": sorted(files, key=lambda f: (f["format"], f["name"])),
     }
+    variables = await run_in_threadpool(here.maps.variables, version)
+    if variables:
+        body["variables"] = variables
     data = json_bytes(body)
     key, signature = here.keys.sign(data)
     signed = f"{key}:{base64.b64encode(signature).decode()}"

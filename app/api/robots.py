@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
 from app import fleet
 from app.api.access import Editor, Principal, Reporter, Viewer
-from app.api.answers import Route, answer
-from app.api.schemas import CHANNEL, NAME, RobotDetailOut, RobotOut, RobotPath, StatusBody, told
+from app.api.answers import Route, answer, page
+from app.api.schemas import CHANNEL, NAME, Cursor, Limit, RobotDetailOut, RobotOut, RobotPath, StatusBody, told
 from app.api.services import Here, Services
 from app.errors import Denied, Invalid, NotFound, Problem
 from app.store.values import Channel, Heard, Move, Report, Robot, rfc3339
@@ -26,16 +26,23 @@ EnvironmentQuery = Annotated[
 
 @router.get("", responses=told(list[RobotOut], 404), summary="All robots")
 def list_robots(
+    request: Request,
     here: Here,
     who: Viewer,
     environment: EnvironmentQuery = None,
     channel: Annotated[str | None, Query(pattern=CHANNEL, description="Only on this channel.")] = None,
+    limit: Limit = 100,
+    cursor: Cursor = None,
 ) -> Response:
-    """What each says of itself, what it drives on, whether it is there, and how far it is behind its channel."""
+    """What each says of itself, what it drives on, whether it is there, and how far it is behind its channel. By
+    environment and name.
+    """
     if environment is not None:
         who.enter(environment)
-    found = [r for r in here.store.robots(environment) if who.may_enter(r.environment)]
-    return answer(_told(here, [r for r in found if channel is None or r.report.channel == channel]))
+    found, following = here.store.robots_page(
+        environment, channel=channel, limit=limit, cursor=cursor, allowed=who.environments
+    )
+    return page(request, _told(here, found), following)
 
 
 @router.get("/{robot}", responses=told(RobotDetailOut, 404), summary="One robot, with what it said before")

@@ -770,6 +770,9 @@ class ManifestOut(BaseModel):
     root: str
     expires: datetime
     files: list[ManifestFile]
+    variables: dict[str, str] | None = Field(
+        None, description="What the place is called: literal variables of an environment_template's scripts."
+    )
 
 
 class JobOut(BaseModel):

@@ -24,7 +24,7 @@ from app.errors import (
     Problem,
     UnreadableFile,
 )
-from app.formats import Limits
+from app.formats import Limits, _shell, environment
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
 from app.pool import Stop, WorkerDied
@@ -154,6 +154,15 @@ class Maps:
         used = formats.all_formats().values() if recipe.format.holds else [recipe.format]
         reasons = [reason for known in used for reason in templates.resolve(recipe.version.templates, known).ignored]
         return list(dict.fromkeys(reasons))
+
+    def variables(self, version: Version) -> dict[str, str]:
+        """What the place is called (``FARM_NAME`` …): an environment_template's literal variables, by name."""
+        keys = [e.key for e in version.parts if e.key.layer == "objects" and e.key.name == environment.NAME]
+        out: dict[str, str] = {}
+        for part in self._store.load(version, keys).vector("objects").values() if keys else ():
+            stored = part.document.get(environment.NAME)
+            out |= _shell.handed_on(stored.get("variables") if isinstance(stored, Mapping) else None)[0]
+        return dict(sorted(out.items()))
 
     def coverage(self, version: Version) -> list[dict[str, Any]]:
         """For every format that can be served: direct, derivable or missing, by which chain, and what to supply."""

@@ -127,6 +127,26 @@ def assignments(data: bytes) -> tuple[dict[str, str], list[str]]:
     return known, warnings
 
 
+def handed_on(variables: object) -> tuple[dict[str, str], list[str], list[str]]:
+    """Stored variables that robots may source; the names that say where files are; why others are left out."""
+    given = variables.items() if isinstance(variables, Mapping) else ()
+    out: dict[str, str] = {}
+    of_files, reasons = [], []
+    for name, value in given:
+        if not isinstance(name, str) or not isinstance(value, str):
+            continue
+        if name in OF_FILES:
+            of_files.append(name)
+            continue
+        try:
+            exports({name: value})
+        except ValueError as error:
+            reasons.append(str(error))
+        else:
+            out[name] = value
+    return out, of_files, reasons
+
+
 def exports(values: Mapping[str, str]) -> bytes:
     """Lines that a shell sources to exactly these values. ValueError for a name or value that must not be handed on."""
     lines = []

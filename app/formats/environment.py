@@ -372,25 +372,16 @@ class _Writer:
 
     def variables(self) -> dict[str, str]:
         """Stored variables but for those that say where files are."""
-        out: dict[str, str] = {}
+        said: dict[str, Any] = {}
         for key, part in self.layers.vector("objects").items():
-            said = part.document.get(NAME) if key.name == NAME else None
-            values = said.get("variables") if isinstance(said, Mapping) else None
-            for name, value in values.items() if isinstance(values, Mapping) else ():
-                out |= {name: value} if isinstance(name, str) and isinstance(value, str) else {}
-        own = [name for name in out if name in _shell.OF_FILES]
+            stored = part.document.get(NAME) if key.name == NAME else None
+            values = stored.get("variables") if isinstance(stored, Mapping) else None
+            said |= values if isinstance(values, Mapping) else {}
+        out, own, reasons = _shell.handed_on(said)
         self.context.drop("variables that name files", len(own), f"they name those of the package now: {some(own)}")
-        left: dict[str, str] = {}
-        for name, value in out.items():
-            if name in own:
-                continue
-            try:
-                _shell.exports({name: value})
-            except ValueError as error:
-                self.context.drop("variables", 1, str(error))
-            else:
-                left[name] = value
-        return left
+        for reason in reasons:
+            self.context.drop("variables", 1, reason)
+        return out
 
     def scripts(self, variables: Mapping[str, str]) -> None:
         properties = {n: v for n, v in variables.items() if n != RELEASE}

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from datetime import datetime
+from fnmatch import fnmatchcase
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, Select, delete, func, insert, select, update
+from sqlalchemy import Connection, Row, Select, delete, func, insert, select, tuple_, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from app.errors import Conflict, FleetMapError, NotFound
+from app.errors import Conflict, FleetMapError, Invalid, NotFound
 from app.store import tables
 from app.store.base import Base, clean, environment_row
 from app.store.values import LATEST, Heard, Held, Move, Report, Robot
@@ -59,6 +60,43 @@ class Robots(Base):
             if robot is not None:
                 query = query.where(table.c.robot == robot)
             return [_as_robot(row) for row in connection.execute(query)]
+
+    def robots_page(
+        self,
+        environment: str | None = None,
+        *,
+        channel: str | None = None,
+        limit: int = 100,
+        cursor: str | None = None,
+        allowed: str | None = None,
+    ) -> tuple[list[Robot], str | None]:
+        """A page of the same list, and the cursor of the next one: ``<environment>/<robot>``, the last one on the page.
+
+        channel: only those that report on it. allowed: a pattern of environments' names (fnmatch). Invalid for a cursor
+        that is none.
+        """
+        table, owner = tables.robot, tables.environment
+        query = _robots().where(owner.c.deleted.is_(None)).order_by(owner.c.name, table.c.robot)
+        if channel is not None:
+            query = query.where(table.c.channel == channel)
+        out: list[Robot] = []
+        many = limit + 1
+        with self._database.read() as connection:
+            if environment is not None:
+                query = query.where(table.c.environment_id == environment_row(connection, environment).id)
+            while len(out) <= limit:
+                page = query
+                if cursor is not None:
+                    place, slash, robot = cursor.partition("/")
+                    if not slash:
+                        raise Invalid("the cursor is not one that a page's Link header gave")
+                    page = query.where(tuple_(owner.c.name, table.c.robot) > tuple_(place, robot))
+                found = [_as_robot(row) for row in connection.execute(page.limit(many))]
+                out += [r for r in found if allowed is None or fnmatchcase(r.environment, allowed)]
+                if len(found) < many:
+                    break
+                cursor = _cursor(found[-1])
+        return out[:limit], _cursor(out[limit - 1]) if len(out) > limit else None
 
     def robot_history(self, environment: str, robot: str, limit: int = HISTORY) -> list[tuple[datetime, Report]]:
         """What a robot said in an environment and when it was heard, newest first, each time it was something new."""
@@ -203,6 +241,10 @@ def robots_of(connection: Connection, environment_id: str, channel: str) -> list
 
 def _as_report(row: Row[Any]) -> Report:
     return Report(row.channel, row.version, row.root, row.state, row.detail, row.sequence, row.said)
+
+
+def _cursor(robot: Robot) -> str:
+    return f"{robot.environment}/{robot.robot}"
 
 
 def _as_robot(row: Row[Any]) -> Robot:

@@ -124,6 +124,18 @@ def recover(robot: Start, gate: Gate) -> None:
     assert whole(one.into)["version"] == 2
 
 
+@pytest.mark.parametrize(
+    "variables",
+    [{"LD_PRELOAD": "/x"}, {"PATH": "/x"}, {"A B": "1"}, {"A;rm": "1"}, {"A": "1\n2"}, {"A": 7}, [1], "x"],
+)
+def test_variables_that_change_how_programs_run(
+    held: str, robot: Start, gate: Gate, keys: Keys, variables: object
+) -> None:
+    gate.change = signed(keys, variables=variables)
+    attacked(robot, gate, word="manifest")
+    recover(robot, gate)
+
+
 def test_an_old_manifest_is_refused(api: Api, held: str, robot: Start, gate: Gate) -> None:
     path = f"environments/{held}/versions/latest/manifest?formats=tmap2"
     gate_open = robot(server=gate.url)

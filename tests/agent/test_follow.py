@@ -194,6 +194,28 @@ def test_environment_sh(api: Api, place: str, robot: Start) -> None:
     assert told == f"{current}/tmap2/network.tmap2.yaml|{current}/occupancy_grid/map.yaml||2\n"
 
 
+def test_environment_sh_says_what_the_place_is_called(api: Api, place: str, robot: Start) -> None:
+    said = b"export FARM_NAME='It'\\''s a \"yard\"; $(touch x)'\nexport FIELD_ID=p1\n"
+    said += b"export TMAP_FILE=/nowhere\nexport LD_PRELOAD=/x\n"
+    api.upload(place, {"config/properties.sh": said, "config/topological/n.tmap2.yaml": network(1)})
+    one = robot("--once")
+    assert one.end() == 0
+
+    def sourced() -> list[str]:
+        script = 'set -eu; . "$1"; printf "%s\\n" "$FARM_NAME" "$FIELD_ID" "$FIELD_TYPE" "$TMAP_FILE" "${LD_PRELOAD:-}"'
+        command = ["sh", "-c", script, "sh", one.into / "current" / "environment.sh"]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split("\n")
+
+    file = str(one.into / "current" / "tmap2" / "network.tmap2.yaml")
+    assert sourced() == ['It\'s a "yard"; $(touch x)', "p1", "", file, "", ""]
+    api.upload(place, {"config/properties.sh": said.replace(b"p1", b"p2")})
+    assert robot("--once").end() == 0
+    assert sourced()[1] == "p2"
+    api.post(f"environments/{place}/versions", {"revert_to": 1})
+    assert robot("--once").end() == 0
+    assert sourced() == ["", "", "", file, "", ""], "nothing stale"
+
+
 def test_two_robots_hold_the_same_root(api: Api, place: str, robot: Start) -> None:
     robots: list[Robot] = [robot("--poll", "3600", name=f"robot-{k}") for k in (1, 2)]
     for one in robots:

@@ -54,6 +54,13 @@ def test_all_grids_are_listed(api: Api, farm: str) -> None:
     assert {"map.yaml", "map.pgm", "keepout.yaml", "keepout.pgm"} <= set(names)
 
 
+def test_it_says_what_the_place_is_called(api: Api, farm: str) -> None:
+    assert "variables" not in manifest(api, farm, "latest", "tmap2")
+    said = b"export FIELD_ID=p1\nexport FARM_NAME='north farm'\nexport DATUM_FILE=/x\nexport PATH=/x\n"
+    api.upload(farm, {"config/properties.sh": said})
+    assert manifest(api, farm, "latest", "tmap2")["variables"] == {"FARM_NAME": "north farm", "FIELD_ID": "p1"}
+
+
 def test_the_sequence_is_that_of_the_channels_move(api: Api, farm: str) -> None:
     sequences = [manifest(api, farm, v, "tmap2")["sequence"] for v in ("2", "latest")]
     assert sequences == [3, 4]

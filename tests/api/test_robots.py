@@ -39,6 +39,33 @@ def test_a_robot_tells_its_status(api: Api, farm: str) -> None:
     assert api.get(f"robots/mower-1?environment={farm}").json()["lag"]["events"] == 0
 
 
+def test_the_list_comes_in_pages(api: Api, farm: str, bare: str) -> None:
+    for env, names in ((farm, ("a", "B", "c", "d.1", "e")), (bare, ("a", "z"))):
+        for name in names:
+            api("PUT", f"robots/{name}/status", 200, json=status(env, "a" * 64))
+    api("PUT", "robots/c/status", 200, json={**status(farm, "a" * 64), "channel": "staging"})
+
+    def walk(caller: Api, path: str) -> list[tuple[str, str]]:
+        out: list[tuple[str, str]] = []
+        while path:
+            answer = caller.get(path)
+            assert 0 < len(answer.json()) <= 2
+            out += [(r["environment"], r["robot"]) for r in answer.json()]
+            path = answer.links["next"]["url"] if "next" in answer.links else ""
+        return out
+
+    whole = [(r["environment"], r["robot"]) for r in api.get("robots?limit=1000").json()]
+    assert walk(api, "robots?limit=2") == whole
+    assert {r for e, r in whole if e == farm} == {"a", "B", "c", "d.1", "e"}
+    own = [pair for pair in whole if pair[0] == farm]
+    assert walk(api, f"robots?environment={farm}&limit=2") == own
+    assert walk(api, f"robots?environment={farm}&limit=2&channel=production") == [p for p in own if p[1] != "c"]
+    limited = api.token_for("viewer", environments=bare)
+    assert walk(limited, "robots?limit=1") == [(bare, "a"), (bare, "z")]
+    api.problem("GET", "robots?cursor=x", 422)
+    api.problem("GET", "robots?limit=0", 422)
+
+
 def test_history_of_a_robot(api: Api, farm: str) -> None:
     for state in ("downloading", "downloading", "ready", "active"):
         api("PUT", "robots/digger/status", 200, json=status(farm, "a" * 64, state))
