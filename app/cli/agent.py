@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 from datetime import UTC, datetime
@@ -111,6 +112,11 @@ def agent(
             agent.run()
     finally:
         agent.close()
+    if not once:
+        # A thread of Zenoh's that still calls back while the interpreter comes down would abort it.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
 
 
 def _line(members: dict[str, Any]) -> str:
