@@ -43,6 +43,10 @@ class Settings(BaseSettings):
     )
     host: str = Field(default="127.0.0.1", description="Address to listen on; `0.0.0.0` for all of the machine's.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on.")
+    tls_certificate: Path | None = Field(
+        default=None, description="Certificate (PEM, with its chain) to serve HTTPS with. Unset: HTTP."
+    )
+    tls_key: Path | None = Field(default=None, description="Private key of that certificate (PEM).")
     workers: int = Field(default=1, ge=1, le=256, description="Processes that answer requests.")
     admin_token: SecretStr | None = Field(
         default=None,
@@ -127,10 +131,31 @@ class Settings(BaseSettings):
         pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$",
         description="Start of every key expression.",
     )
+    zenoh_certificate: Path | None = Field(
+        default=None,
+        description="Certificate (PEM, with its chain) for `tls/` endpoints: the router shows it, and the server where "
+        "a router asks for one.",
+    )
+    zenoh_key: Path | None = Field(default=None, description="Private key of that certificate (PEM).")
+    zenoh_ca: Path | None = Field(
+        default=None,
+        description="Certification authority (PEM) that signs the router's certificate, and the robots' where they "
+        "need one. Unset: the public ones.",
+    )
+    zenoh_mtls: bool = Field(
+        default=False, description="Robots must show a certificate that `FLEETMAP_ZENOH_CA` has signed."
+    )
+    zenoh_users: Path | None = Field(
+        default=None,
+        description="File of `NAME:PASSWORD` lines, a robot's name each: nobody else comes in, and only the server "
+        "puts events and maps; a robot puts its own status. Read at the start. Unset: everybody comes in.",
+    )
+    zenoh_user: str | None = Field(default=None, description="The server's name at the router, as `client`.")
+    zenoh_password: SecretStr | None = Field(default=None, description="The server's password at the router.")
     zenoh_config: Path | None = Field(
         default=None,
-        description="A JSON5 file of Zenoh's own configuration: TLS, users, access control. Where to listen and "
-        "connect stands in the settings above.",
+        description="A JSON5 file of Zenoh's own configuration, for all else; access control that stands in it takes "
+        "the place of ours.",
     )
     zenoh_max_reply_bytes: int = Field(
         default=64 * 2**20,
@@ -239,6 +264,14 @@ class Settings(BaseSettings):
         "database_url",
         "blob_url",
         "admin_token",
+        "tls_certificate",
+        "tls_key",
+        "zenoh_certificate",
+        "zenoh_key",
+        "zenoh_ca",
+        "zenoh_users",
+        "zenoh_user",
+        "zenoh_password",
         "zenoh_config",
         "imagery_url",
         "imagery_token",
@@ -269,6 +302,34 @@ class Settings(BaseSettings):
     def _client_needs_a_router(self) -> Self:
         if self.zenoh_mode == "client" and not self.zenoh_connect.strip():
             raise ValueError("zenoh_mode client needs zenoh_connect: where the router is, like tcp/router:7447")
+        return self
+
+    @model_validator(mode="after")
+    def _certificates_have_keys(self) -> Self:
+        for what in ("tls", "zenoh"):
+            if (getattr(self, f"{what}_certificate") is None) != (getattr(self, f"{what}_key") is None):
+                raise ValueError(f"{what}_certificate and {what}_key go together")
+        return self
+
+    @model_validator(mode="after")
+    def _zenoh_security_is_whole(self) -> Self:
+        if (self.zenoh_user is None) != (self.zenoh_password is None):
+            raise ValueError("zenoh_user and zenoh_password go together")
+        if self.zenoh_mode == "router":
+            encrypted = any(part.strip().startswith(("tls/", "quic/")) for part in self.zenoh_listen.split(","))
+            if encrypted and self.zenoh_certificate is None and self.zenoh_config is None:
+                raise ValueError("zenoh_listen with tls/ needs zenoh_certificate and zenoh_key")
+            if self.zenoh_certificate is not None and not encrypted:
+                raise ValueError("zenoh_certificate is for encrypted endpoints: zenoh_listen=tls/0.0.0.0:7447")
+            if self.zenoh_users is not None and self.zenoh_connect.strip() and self.zenoh_config is None:
+                raise ValueError(
+                    "with zenoh_users only the server and its robots may say anything: what other routers may say has "
+                    "to stand in the access control of a zenoh_config"
+                )
+        elif self.zenoh_users is not None or self.zenoh_mtls:
+            raise ValueError("zenoh_users and zenoh_mtls are for zenoh_mode=router: another router has its own users")
+        if self.zenoh_mtls and (self.zenoh_ca is None or self.zenoh_certificate is None):
+            raise ValueError("zenoh_mtls needs zenoh_ca, zenoh_certificate and zenoh_key")
         return self
 
     @field_validator("ros2_environments", "ros2_keys")

@@ -64,10 +64,13 @@ from app.api.uploads import Intake
 from app.config import Settings
 from app.convert import Maps
 from app.errors import FleetMapError, Unavailable
+from app.events import bus
 from app.events.bus import Bus, BusOptions
+from app.events.login import Login
 from app.events.relay import Relay
 from app.events.ros2 import Ros2, Ros2Options
 from app.events.ros_names import parse_chosen, parse_keys
+from app.events.security import Security
 from app.fleet import Intake as FleetIntake
 from app.fleet import decide
 from app.ingest import Ingest, Provider
@@ -187,6 +190,8 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
         "timeout_keep_alive": 30,
         "timeout_graceful_shutdown": 20,
     }
+    if settings.tls_certificate is not None:
+        options |= {"ssl_certfile": str(settings.tls_certificate), "ssl_keyfile": str(settings.tls_key)}
     config = uvicorn.Config(app, **{**options, **more})
     config.head_seconds = settings.header_seconds  # type: ignore[attr-defined]  # read by BoundedProtocol
     return config
@@ -336,6 +341,12 @@ def ros2_of(settings: Settings, here: Services) -> Ros2 | None:
     return publishing
 
 
+def check_bus(settings: Settings) -> None:
+    """Whether the settings of Zenoh can be used: files are there, users are such. Raises FleetMapError."""
+    if settings.zenoh_mode != "off":
+        bus.check(_bus_options(settings))
+
+
 def _bus_options(settings: Settings) -> BusOptions:
     return BusOptions(
         mode=settings.zenoh_mode,
@@ -344,6 +355,18 @@ def _bus_options(settings: Settings) -> BusOptions:
         prefix=settings.zenoh_prefix,
         config=settings.zenoh_config,
         max_reply_bytes=settings.zenoh_max_reply_bytes,
+        security=Security(
+            Login(
+                settings.zenoh_ca,
+                settings.zenoh_certificate,
+                settings.zenoh_key,
+                settings.zenoh_user,
+                settings.zenoh_password.get_secret_value() if settings.zenoh_password else None,
+            ),
+            settings.zenoh_mtls,
+            settings.zenoh_users,
+            settings.data_dir,
+        ),
     )
 
 

@@ -10,7 +10,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from app.agent.trust import File, Manifest
 from app.agent.web import Busy, Stopped, Web
 from app.errors import FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.events import messages
+from app.events.login import Login
 from app.events.messages import RobotState, RobotStatus
 
 LATEST = "latest"
@@ -54,7 +55,10 @@ Tell = Callable[..., None]
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How to run. channel: None follows production where there is one, else latest. key: to trust at first contact."""
+    """How to run. channel: None follows production where there is one, else latest. key: to trust at first contact.
+
+    zenoh_login: at the router; a password without a user is the robot's. ca: who signs the server's certificate.
+    """
 
     server: str
     environment: str
@@ -69,6 +73,8 @@ class Options:
     zenoh_connect: str | None = None
     zenoh_prefix: str | None = None
     zenoh_config: Path | None = None
+    zenoh_login: Login = field(default_factory=Login)
+    ca: Path | None = None
 
 
 def robot_name(text: str | None = None) -> str:
@@ -87,10 +93,14 @@ class Agent:
             trust.check_given(options.key)
         self.options, self._tell = options, tell
         self._robot = robot_name(options.robot)
+        self._login = options.zenoh_login
+        if self._login.password is not None and self._login.user is None:
+            self._login = dataclasses.replace(self._login, user=self._robot)
+        self._login.values()  # Invalid comes now, not in the session's thread
         self._stopping = threading.Event()
         self._wake = threading.Event()
         self._folder = Folder(options.into)
-        self._web = Web(options.server, options.token, self._stopping)
+        self._web = Web(options.server, options.token, self._stopping, options.ca)
         self._ear: Ear | None = None
         self._state = State(options.environment)
         self._events: dict[int, messages.Event] = {}
@@ -150,6 +160,7 @@ class Agent:
             heard=self._heard,
             back=self._back,
             config=self.options.zenoh_config,
+            login=self._login,
         )
         if (installed := self._folder.manifest(self._folder.standing)) is not None:
             self._tell("holding", version=installed.version, root=installed.root)

@@ -18,6 +18,7 @@ from zenoh import ext
 
 from app.errors import FleetMapError
 from app.events import messages
+from app.events.login import Login
 
 LOOK_SECONDS = 0.5
 """Between two looks whether the router is there."""
@@ -41,9 +42,10 @@ class Ear:
         heard: Callable[[messages.Event], None],
         back: Callable[[], None],
         config: Path | None = None,
+        login: Login | None = None,
     ) -> None:
         self._environment, self._robot, self._heard, self._back = environment, robot, heard, back
-        self._config = config
+        self._config, self._login = config, login or Login()
         self._where: tuple[str, str] | None = None
         self._session: zenoh.Session | None = None
         self._held: list[Any] = []
@@ -124,7 +126,7 @@ class Ear:
         assert self._where is not None
         connect, prefix = self._where
         try:
-            session = zenoh.open(configuration(connect, self._config))
+            session = zenoh.open(configuration(connect, self._config, self._login))
         except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
             lines = str(error).splitlines()
             self.problem = f"no router at {connect}: {lines[0][:300] if lines else error!r}"
@@ -171,8 +173,11 @@ class Ear:
                 _close(session)
 
 
-def configuration(connect: str, file: Path | None = None) -> zenoh.Config:
-    """A client of the routers at ``connect`` (separated by commas). file: Zenoh's own JSON5 for TLS and users."""
+def configuration(connect: str, file: Path | None = None, login: Login | None = None) -> zenoh.Config:
+    """A client of the routers at ``connect`` (separated by commas). file: Zenoh's own JSON5, for all else.
+
+    Raises Invalid where a file of the login is missing.
+    """
     config = zenoh.Config.from_file(str(file)) if file is not None else zenoh.Config()
     values: Mapping[str, Any] = {
         "mode": "client",
@@ -182,6 +187,7 @@ def configuration(connect: str, file: Path | None = None) -> zenoh.Config:
         "listen/endpoints": [],
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
+        **(login or Login()).values(),
     }
     for key, value in values.items():
         config.insert_json5(key, json.dumps(value))

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import os
+import ssl
 import sys
 import threading
 from collections.abc import Iterable, Iterator, Mapping
@@ -53,15 +54,32 @@ class Busy(Unavailable):
         self.seconds = seconds
 
 
-class Web:
-    """A server, with one token. Methods raise FleetMapError where it says no, or nothing."""
+def trusting(ca: Path) -> ssl.SSLContext:
+    """TLS that believes certificates of this certification authority alone. Raises Invalid."""
+    try:
+        return ssl.create_default_context(cafile=ca)
+    except (OSError, ssl.SSLError) as error:
+        raise Invalid(f"{ca} holds no certificate of a certification authority (PEM): {error}") from error
 
-    def __init__(self, server: str, token: str | None, stopping: threading.Event) -> None:
+
+class Web:
+    """A server, with one token. Methods raise FleetMapError where it says no, or nothing.
+
+    ca: who signs the server's certificate (PEM); without it, public certification authorities.
+    """
+
+    def __init__(self, server: str, token: str | None, stopping: threading.Event, ca: Path | None = None) -> None:
         self.server = (server if "://" in server else f"http://{server}").rstrip("/")
         headers = {"User-Agent": "fleetmap-agent", "Accept-Encoding": "identity"}
         if token:
             headers["Authorization"] = f"Bearer {token}"
-        self._http = httpx.Client(base_url=self.server, headers=headers, timeout=TIMEOUT, follow_redirects=False)
+        self._http = httpx.Client(
+            base_url=self.server,
+            headers=headers,
+            timeout=TIMEOUT,
+            follow_redirects=False,
+            verify=True if ca is None else trusting(ca),
+        )
         self._stopping = stopping
         self.received = 0
         self.deltas = 0

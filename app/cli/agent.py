@@ -50,7 +50,30 @@ def agent(
     ] = None,
     zenoh_config: Annotated[
         Path | None,
-        typer.Option("--zenoh-config", envvar="FLEETMAP_ZENOH_CONFIG", help="Zenoh's own JSON5: TLS, user, password."),
+        typer.Option("--zenoh-config", envvar="FLEETMAP_ZENOH_CONFIG", help="Zenoh's own JSON5, for all else."),
+    ] = None,
+    zenoh_ca: Annotated[
+        Path | None,
+        typer.Option(
+            "--zenoh-ca", envvar="FLEETMAP_ZENOH_CA", help="Who signs the router's certificate, PEM [default: public]."
+        ),
+    ] = None,
+    zenoh_certificate: Annotated[
+        Path | None,
+        typer.Option(
+            "--zenoh-certificate", envvar="FLEETMAP_ZENOH_CERTIFICATE", help="The robot's own, where one is asked for."
+        ),
+    ] = None,
+    zenoh_key: Annotated[
+        Path | None, typer.Option("--zenoh-key", envvar="FLEETMAP_ZENOH_KEY", help="Private key of that certificate.")
+    ] = None,
+    zenoh_user: Annotated[
+        str | None,
+        typer.Option("--zenoh-user", envvar="FLEETMAP_ZENOH_USER", help="User at the router [default: the robot]."),
+    ] = None,
+    ca: Annotated[
+        Path | None,
+        typer.Option("--ca", envvar="FLEETMAP_CA", help="Who signs the server's certificate, PEM [default: public]."),
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="Bring the folder up to date once, and end.")] = False,
     server: options.Server = None,
@@ -60,11 +83,13 @@ def agent(
     """Keep a folder at the channel's map, on a robot.
 
     It listens for events, fetches what differs, verifies signature and hashes, and switches `current` at once. It goes
-    on without a server or a network, and reports how the robot is.
+    on without a server or a network, and reports how the robot is. Its password at the router is
+    FLEETMAP_ZENOH_PASSWORD.
     """
     from app.agent.core import Agent, Options, robot_name
     from app.cli.client import DEFAULT_SERVER
     from app.errors import Invalid
+    from app.events.login import Login
 
     names = tuple(dict.fromkeys(part.strip() for part in formats.split(",") if part.strip()))
     if not names:
@@ -94,6 +119,14 @@ def agent(
             zenoh_connect=zenoh_connect or None,
             zenoh_prefix=zenoh_prefix or None,
             zenoh_config=zenoh_config,
+            zenoh_login=Login(
+                zenoh_ca,
+                zenoh_certificate,
+                zenoh_key,
+                zenoh_user or None,
+                os.environ.get("FLEETMAP_ZENOH_PASSWORD") or None,
+            ),
+            ca=ca,
         ),
         tell,
     )

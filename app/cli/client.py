@@ -17,6 +17,7 @@ from urllib.parse import quote, urljoin
 
 import httpx
 
+from app.agent.web import trusting
 from app.cli.output import Bar, progress_bar
 
 DEFAULT_SERVER = "http://127.0.0.1:8000"
@@ -114,7 +115,14 @@ class Client:
         headers = {"User-Agent": "fleetmap"}
         if self.token:
             headers["Authorization"] = f"Bearer {self.token}"
-        self._http = httpx.Client(base_url=self.server, headers=headers, timeout=TIMEOUT, follow_redirects=False)
+        ca = os.environ.get("FLEETMAP_CA")
+        self._http = httpx.Client(
+            base_url=self.server,
+            headers=headers,
+            timeout=TIMEOUT,
+            follow_redirects=False,
+            verify=trusting(Path(ca)) if ca else True,
+        )
 
     def __enter__(self) -> Self:
         return self

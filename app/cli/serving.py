@@ -8,6 +8,7 @@ import os
 import secrets
 import signal
 import socket
+import ssl
 import sys
 import threading
 import time
@@ -34,7 +35,7 @@ value. It is no setting itself, since it says where settings are."""
 START_SECONDS = 60.0
 """How long the demo waits for the server to be ready."""
 
-NOT_FLAGS = frozenset({"admin_token"})
+NOT_FLAGS = frozenset({"admin_token", "zenoh_password"})
 """Settings that must not stand in a command line, where every user of the machine can read them."""
 
 DEMO_TOKEN = "demo-token"  # noqa: S105  the name of a file
@@ -50,13 +51,17 @@ def serve(*, demo: bool = False, **values: Any) -> None:
     that FLEETMAP_SECRETS_DIR names.
     """
     settings = load_settings(values)
+    if demo and settings.tls_certificate is not None:
+        raise typer.BadParameter("the demo is shown over plain HTTP: leave out --demo or --tls-certificate")
+    _check_certificate(settings)
     if demo:
         settings = with_demo_token(settings)
     listener = listen(settings.host, settings.port)
     try:
-        address = address_of(listener)
+        address = address_of(listener, secure=settings.tls_certificate is not None)
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
         check(settings)
+        _main().check_bus(settings)
         os.environ.update(settings.as_environment())  # what worker processes read
         _compile(settings.data_dir / "native")
         output.show(f"Fleet Map Server: {address} · documentation: {address}/docs")
@@ -204,11 +209,22 @@ def listen(host: str, port: int) -> socket.socket:
     return listener
 
 
-def address_of(listener: socket.socket) -> str:
+def address_of(listener: socket.socket, *, secure: bool = False) -> str:
     """Where a client on this machine reaches it."""
+    scheme = "https" if secure else "http"
     host, port = listener.getsockname()[:2]
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104  compared, not bound
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    return f"{scheme}://[{host}]:{port}" if ":" in host else f"{scheme}://{host}:{port}"
+
+
+def _check_certificate(settings: Settings) -> None:
+    """BadParameter where HTTPS could not be served with what was given."""
+    if settings.tls_certificate is None or settings.tls_key is None:
+        return
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(settings.tls_certificate, settings.tls_key)
+    except (OSError, ssl.SSLError) as error:
+        raise typer.BadParameter(f"--tls-certificate and --tls-key cannot be used: {error}") from error
 
 
 def check(settings: Settings) -> None:

@@ -15,7 +15,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +25,7 @@ from zenoh import ext
 from app.errors import FleetMapError, Unavailable
 from app.events import messages
 from app.events.router import Router
+from app.events.security import Security
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +47,7 @@ Mode = Literal["router", "client", "off"]
 
 @dataclass(frozen=True, slots=True)
 class BusOptions:
-    """How to reach the fleet. config: a JSON5 file of Zenoh's own for TLS, users and access control."""
+    """How to reach the fleet. config: a JSON5 file of Zenoh's own, for what ``security`` does not say."""
 
     mode: Mode = "router"
     listen: str = "tcp/127.0.0.1:7447"
@@ -54,6 +55,7 @@ class BusOptions:
     prefix: str = messages.PREFIX
     config: Path | None = None
     max_reply_bytes: int = 64 * 2**20
+    security: Security = field(default_factory=Security)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +77,11 @@ OnAlive = Callable[[str, bool], None]
 
 
 def router_configuration(options: BusOptions) -> str:
-    """The router's configuration: the operator's file, and what this server decides."""
+    """The router's configuration: the operator's file, and what this server decides. Raises FleetMapError."""
     config = _base(options)
+    own_rules = bool(json.loads(config.get_json("access_control/enabled")))
+    for key, value in options.security.router_values(options.prefix, access=not own_rules).items():
+        _set(config, key, value)
     _set(config, "mode", "router")
     _set(config, "listen/endpoints", [part.strip() for part in options.listen.split(",")])
     _set(config, "connect/endpoints", [part.strip() for part in options.connect.split(",") if part.strip()])
@@ -87,20 +92,32 @@ def router_configuration(options: BusOptions) -> str:
 
 
 def session_configuration(options: BusOptions) -> str:
-    """The configuration of the server's own session: a client of its router, or of the operator's."""
+    """The configuration of the server's own session: a client of its router, or of the operator's. FleetMapError."""
     config = _base(options)
     where = options.connect if options.mode == "client" else reachable(options.listen)
     _set(config, "mode", "client")
     _set(config, "connect/endpoints", [part.strip() for part in where.split(",") if part.strip()])
     _set(config, "connect/timeout_ms", int(CONNECT_SECONDS * 1000))
     _set(config, "connect/exit_on_failure", True)
+    _set(config, "connect/retry", {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2})
     _set(config, "listen/endpoints", [])
     _set(config, "scouting/multicast/enabled", False)
     _set(config, "transport/shared_memory/enabled", False)
     with contextlib.suppress(zenoh.ZError):
         _set(config, "access_control/enabled", False)  # the router's business
         _set(config, "transport/auth/usrpwd/dictionary_file", None)
+    security = options.security
+    for key, value in (security.login.values() if options.mode == "client" else security.session_values()).items():
+        _set(config, key, value)
     return str(config)
+
+
+def check(options: BusOptions) -> None:
+    """Whether what an operator has set up can be used, told before anything starts. Raises FleetMapError."""
+    if options.mode == "router":
+        router_configuration(options)
+    if options.mode != "off":
+        session_configuration(options)
 
 
 def reachable(listen: str) -> str:

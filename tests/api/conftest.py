@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import ssl
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -33,11 +34,12 @@ class Api:
     url: str
     app: FastAPI
     token: str | None = ADMIN
+    verify: ssl.SSLContext | bool = True
 
     def __post_init__(self) -> None:
         headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
         self.others: list[Api] = []
-        self.http = httpx.Client(base_url=self.url, headers=headers, timeout=60.0)
+        self.http = httpx.Client(base_url=self.url, headers=headers, timeout=60.0, verify=self.verify)
 
     def __call__(self, method: str, path: str, expect: int | None = None, **more: Any) -> httpx.Response:
         """Send a request; a path that does not start with / lies below the API."""
@@ -65,7 +67,7 @@ class Api:
 
     def as_(self, token: str | None) -> Api:
         """A client with another token; it is closed together with this one."""
-        other = Api(self.url, self.app, token)
+        other = Api(self.url, self.app, token, self.verify)
         self.others.append(other)
         return other
 
@@ -101,8 +103,8 @@ def problem(answer: httpx.Response) -> dict[str, Any]:
 
 
 @contextmanager
-def running(settings: Settings) -> Iterator[Api]:
-    """A server with these settings until the block ends."""
+def running(settings: Settings, verify: ssl.SSLContext | bool = True) -> Iterator[Api]:
+    """A server with these settings until the block ends. verify: whose certificate to believe, of HTTPS."""
     app = create_app(settings)
     server = uvicorn.Server(server_config(settings, app, port=0))
     thread = threading.Thread(target=server.run)
@@ -114,7 +116,8 @@ def running(settings: Settings) -> Iterator[Api]:
             assert time.monotonic() < deadline, "the server did not start in time"
             time.sleep(0.01)
         port = server.servers[0].sockets[0].getsockname()[1]
-        api = Api(f"http://127.0.0.1:{port}", app)
+        scheme = "https" if settings.tls_certificate else "http"
+        api = Api(f"{scheme}://127.0.0.1:{port}", app, verify=verify)
         try:
             yield api
         finally:

@@ -6,12 +6,16 @@ import contextlib
 import signal
 import socket
 import sqlite3
+import ssl
+import urllib.error
 import urllib.request
 from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import Fleetmap, ServerProcess
+from tests.certificates import Authority
+from tests.cli.conftest import TOKEN, Fleetmap, ServerProcess
+from tests.events.conftest import eventually
 
 
 def start(folder: Path, *arguments: str, **environment: str) -> ServerProcess:
@@ -105,13 +109,54 @@ def test_unusable_settings_are_usage_errors(
     assert named in " ".join(told.err.split())
 
 
+def test_https_by_two_flags(tmp_path: Path) -> None:
+    authority = Authority(tmp_path)
+    certificate, key = authority.sign("server")
+    trusting = ssl.create_default_context(cafile=authority.pem)
+    files = ("--tls-certificate", str(certificate), "--tls-key", str(key))
+    process = start(tmp_path, *files, FLEETMAP_ADMIN_TOKEN=TOKEN)
+    try:
+        address = process.wait_for(r"Fleet Map Server: (https://\S+)")[1]
+
+        def answers() -> bool:
+            try:
+                with urllib.request.urlopen(f"{address}/healthz", timeout=60, context=trusting) as answer:
+                    return bool(answer.status == 200)
+            except ConnectionError:
+                return False
+            except urllib.error.URLError as error:
+                assert isinstance(error.reason, ConnectionError), "it does not listen yet"
+                return False
+
+        eventually(answers, 60)
+        with pytest.raises(urllib.error.URLError, match="CERTIFICATE_VERIFY_FAILED"):
+            urllib.request.urlopen(f"{address}/healthz", timeout=60)
+    finally:
+        assert process.stop() == 0
+
+
+def test_files_that_cannot_be_used_end_the_start(tmp_path: Path, offline: Fleetmap) -> None:
+    data = ("--data-dir", tmp_path / "data", "--port", "0")
+    certificate, key = Authority(tmp_path).sign("server")
+    other = Authority(tmp_path / "other").sign("server")[1]
+    told = offline("serve", *data, "--tls-certificate", certificate, "--tls-key", other)
+    assert told.status == 2
+    assert "--tls-certificate and --tls-key cannot be used" in " ".join(told.err.split())
+    told = offline("serve", "--demo", *data, "--tls-certificate", certificate, "--tls-key", key)
+    assert told.status == 2
+    (tmp_path / "users").write_text("r1\n")
+    told = offline("serve", *data, "--zenoh-users", tmp_path / "users")
+    assert told.status == 1
+    assert "line 1: not NAME:PASSWORD" in " ".join(told.err.split())
+
+
 def test_every_setting_is_a_flag_but_secrets(offline: Fleetmap, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.config import Settings
 
     monkeypatch.setenv("COLUMNS", "200")
     told = offline("serve", "--help").out
     for name in Settings.model_fields:
-        assert (f"--{name.replace('_', '-')} " in told) == (name != "admin_token"), name
+        assert (f"--{name.replace('_', '-')} " in told) == (name not in ("admin_token", "zenoh_password")), name
 
 
 def test_workers_end_with_the_process_that_started_them(tmp_path: Path) -> None:

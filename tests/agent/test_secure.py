@@ -1,0 +1,131 @@
+"""A real agent process over HTTPS and TLS, with a password of its own."""
+
+from __future__ import annotations
+
+import os
+import ssl
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.agent.conftest import ROOT, Robot, network
+from tests.api.conftest import ADMIN, Api, running, settings_for
+from tests.certificates import Authority
+from tests.events.conftest import eventually, free_port
+from tests.events.test_fleet import robot_of
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
+    return Authority(tmp_path_factory.mktemp("certificates"))
+
+
+@pytest.fixture(scope="module")
+def secure(tmp_path_factory: pytest.TempPathFactory, authority: Authority) -> Iterator[Api]:
+    folder = tmp_path_factory.mktemp("secure")
+    users = folder / "users"
+    users.write_text("tractor:of the tractor\n")
+    certificate, key = authority.sign("server")
+    settings = settings_for(
+        folder / "data",
+        tls_certificate=certificate,
+        tls_key=key,
+        zenoh_mode="router",
+        zenoh_listen=f"tls/127.0.0.1:{free_port()}",
+        zenoh_certificate=certificate,
+        zenoh_key=key,
+        zenoh_ca=authority.pem,
+        zenoh_mtls=True,
+        zenoh_users=users,
+    )
+    with running(settings, ssl.create_default_context(cafile=authority.pem)) as api:
+        eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
+        yield api
+
+
+def place(api: Api, name: str) -> str:
+    api.post("environments", {"name": name})
+    api.upload(name, {"n.tmap2.yaml": network(count=20)})
+    return name
+
+
+def test_an_agent_follows_over_tls(secure: Api, authority: Authority, tmp_path: Path) -> None:
+    env = place(secure, "farm")
+    certificate, key = authority.sign("tractor")
+    variables = {
+        "FLEETMAP_CA": str(authority.pem),
+        "FLEETMAP_ZENOH_CA": str(authority.pem),
+        "FLEETMAP_ZENOH_CERTIFICATE": str(certificate),
+        "FLEETMAP_ZENOH_KEY": str(key),
+        "FLEETMAP_ZENOH_PASSWORD": "of the tractor",
+    }
+    one = Robot(secure.url, env, tmp_path / "tractor", "--poll", "3600", **variables)
+    try:
+        one.wait("active", version=1)
+        one.wait("connected")
+        secure.upload(env, {"n.tmap2.yaml": network(0.25, count=20)})
+        one.wait("active", 20, version=2)
+        assert one.standing["version"] == 2
+        assert eventually(lambda: (r := robot_of(secure, "tractor")) and r["online"] and r["version"] == 2)
+        assert one.stop() == 0
+    finally:
+        one.kill()
+    assert not [line for line in one.lines if "of the tractor" in str(line)]
+
+
+def test_an_agent_with_a_wrong_password_still_polls(secure: Api, authority: Authority, tmp_path: Path) -> None:
+    env = place(secure, "field")
+    certificate, key = authority.sign("stranger")
+    one = Robot(
+        secure.url, env, tmp_path / "tractor", "--poll", "0.5", "--ca", str(authority.pem), "--zenoh-ca",
+        str(authority.pem), "--zenoh-certificate", str(certificate), "--zenoh-key", str(key), "--zenoh-user", "tractor",
+        FLEETMAP_ZENOH_PASSWORD="guessed",
+    )  # fmt: skip
+    try:
+        one.wait("active", version=1)
+        secure.upload(env, {"n.tmap2.yaml": network(0.5, count=20)})
+        one.wait("active", 20, version=2)
+        assert one.saw("connected") is None
+        assert one.stop() == 0
+    finally:
+        one.kill()
+
+
+def test_an_agent_believes_no_other_authority(secure: Api, tmp_path: Path) -> None:
+    env = place(secure, "wood")
+    other = Authority(tmp_path / "others")
+    for more in ((), ("--ca", str(other.pem))):
+        one = Robot(secure.url, env, tmp_path / "robot", "--once", *more)
+        try:
+            assert one.end() == 1
+        finally:
+            one.kill()
+        assert "certificate" in str(one.lines).lower()
+        assert not (tmp_path / "robot" / "current").exists()
+    for more, told in (
+        (("--ca", str(tmp_path / "gone.pem")), "gone.pem"),
+        (("--zenoh-ca", str(tmp_path / "gone.pem")), "gone.pem cannot be read"),
+        (("--zenoh-certificate", str(other.pem)), "needs its key"),
+        (("--zenoh-user", "tractor"), "needs a password"),
+    ):
+        one = Robot(secure.url, env, tmp_path / "robot", "--once", *more)
+        assert one.end() != 0
+        assert told in " ".join(str(line.get("text")) for line in one.lines), one.lines
+
+
+def test_the_command_line_over_https(secure: Api, authority: Authority) -> None:
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
+    known = {**clean, "FLEETMAP_SERVER": secure.url, "FLEETMAP_TOKEN": ADMIN, "PYTHONPATH": str(ROOT)}
+    for more, status in (({"FLEETMAP_CA": str(authority.pem)}, 0), ({}, 1)):
+        told = subprocess.run(
+            [sys.executable, "-m", "app.cli", "versions", "--json"],
+            env={**known, **more},
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert told.returncode == status, told.stderr

@@ -1,0 +1,374 @@
+"""A router with TLS, users and access control: who comes in, who hears, who may say what."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import stat
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from app.cli.serving import check
+from app.errors import Invalid, Unavailable
+from app.events.bus import BusOptions, router_configuration, session_configuration
+from app.events.bus import check as check_bus
+from app.events.login import Login
+from app.events.router import Router
+from app.events.security import Security, access_control, read_users
+from app.main import check_bus as check_settings
+from tests.api import samples
+from tests.api.conftest import Api, running, settings_for
+from tests.certificates import Authority
+from tests.events.conftest import Listener, client_config, eventually, free_port
+from tests.events.test_fleet import robot_of, said
+from tests.events.test_ros2 import GRID, STRING, Heard, grid_of
+
+REFUSED_SECONDS = 1.0
+"""A client that is refused tries so long: Zenoh does not tell it why, it goes on trying."""
+
+
+# --- who comes in ---------------------------------------------------------------------------------------------------
+def session_to(port: int, login: Login, *, scheme: str = "tls", patience: float = 10.0) -> zenoh.Session:
+    """A robot's session; ZError where it is not let in."""
+    more = {
+        "connect/endpoints": [f"{scheme}/127.0.0.1:{port}"],
+        "connect/timeout_ms": int(patience * 1000),
+        "connect/exit_on_failure": True,
+        "listen/endpoints": [],
+        **login.values(),
+    }
+    return zenoh.open(client_config(port, **more))
+
+
+def refused(port: int, login: Login, scheme: str = "tls") -> None:
+    with pytest.raises(zenoh.ZError), session_to(port, login, scheme=scheme, patience=REFUSED_SECONDS):
+        pass
+
+
+@pytest.fixture(scope="module")
+def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
+    return Authority(tmp_path_factory.mktemp("certificates"))
+
+
+@pytest.fixture(scope="module")
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture(scope="module")
+def api(tmp_path_factory: pytest.TempPathFactory, authority: Authority, port: int) -> Iterator[Api]:
+    """A server whose router shows a certificate and knows two robots."""
+    folder = tmp_path_factory.mktemp("secure")
+    users = folder / "users"
+    users.write_text("# the fleet\nr1:word one\n\nr2:word:two\n")
+    certificate, key = authority.sign("server")
+    settings = settings_for(
+        folder / "data",
+        zenoh_mode="router",
+        zenoh_listen=f"tls/127.0.0.1:{port}",
+        zenoh_certificate=certificate,
+        zenoh_key=key,
+        zenoh_ca=authority.pem,
+        zenoh_users=users,
+        ros2_environments="farm=/",
+        ros2_keys="rmw_zenoh",
+    )
+    check(settings)
+    check_settings(settings)
+    with running(settings) as api:
+        eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
+        eventually(lambda: api.get("/readyz").json()["ros2"]["state"] == "connected")
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", samples.grid())
+        yield api
+
+
+@pytest.fixture
+def r1(api: Api, port: int, authority: Authority) -> Iterator[zenoh.Session]:
+    with session_to(port, Login(authority.pem, user="r1", password="word one")) as session:
+        yield session
+
+
+@pytest.fixture
+def r2(api: Api, port: int, authority: Authority) -> Iterator[zenoh.Session]:
+    with session_to(port, Login(authority.pem, user="r2", password="word:two")) as session:
+        yield session
+
+
+def test_a_robot_hears_asks_and_tells(api: Api, r1: zenoh.Session) -> None:
+    ear = Listener(r1, "fleetmap/farm/events")
+    ear.wait(lambda e: e.sequences() == [1, 2])  # history comes over keys of its own
+    api.upload("farm", {"network.tmap2.yaml": samples.tmap2()})
+    ear.wait(lambda e: e.sequences() == [1, 2, 3])
+    reply = next(iter(r1.get("fleetmap/farm/1/version", timeout=20.0)))
+    assert reply.ok is not None
+    assert json.loads(bytes(reply.ok.payload))["version"] == 1
+    alive = r1.liveliness().get("fleetmap/server", timeout=5.0)
+    assert [str(one.ok.key_expr) for one in alive if one.ok] == ["fleetmap/server"]
+    token = r1.liveliness().declare_token("fleetmap/robots/r1")
+    r1.put("fleetmap/farm/robots/r1/status", said(1))
+    assert eventually(lambda: (r := robot_of(api, "r1")) and r["online"] and r["version"] == 1)
+    token.undeclare()  # type: ignore[no-untyped-call]
+    grid = grid_of(Heard(r1, f"0/map/{GRID}").wait())
+    assert grid["cells"].shape == (6, 8)
+
+
+def test_a_robot_says_nothing_else(api: Api, r1: zenoh.Session, r2: zenoh.Session) -> None:
+    events, topics = Listener(r2, "fleetmap/*/events"), Heard(r2, f"0/map/{GRID}")
+    everything: list[tuple[str, zenoh.SampleKind, bytes]] = []
+    r2.declare_subscriber("**", lambda s: everything.append((str(s.key_expr), s.kind, bytes(s.payload))))
+    topics.wait()
+    events.wait(lambda e: 2 in e.sequences())
+    for key in ("fleetmap/farm/events", f"0/map/{GRID}", "map", "anything", "fleetmap/farm/1/version"):
+        r1.put(key, b'{"sequence": 9999}')
+        r1.delete(key)
+    r1.put("fleetmap/farm/robots/r2/status", said(66))
+    r1.put("fleetmap/nowhere/robots/r1/status/more", said(66))
+    tokens = [r1.liveliness().declare_token(key) for key in ("fleetmap/robots/r2", "fleetmap/server", "@ros2_lv/0/x")]
+    forged = r1.declare_queryable("fleetmap/farm/1/version", lambda query: query.reply(query.key_expr, b"forged"))
+    r1.put("fleetmap/farm/robots/r1/status", said(2))  # what was said before was taken or dropped before
+    eventually(lambda: (r := robot_of(api, "r1")) and r["version"] == 2)
+    made = api.upload("farm", {"network.tmap2.yaml": samples.tmap2(edges=(("gate", "barn"),))}).json()
+    events.wait(lambda e: e.events[-1]["version"] == made["version"])
+    eventually(lambda: any("topological_map_2" in key for key, _, _ in everything))
+    assert [event["sequence"] for event in events.events] == list(range(1, len(events.events) + 1))
+    assert len(topics.samples) == 1
+    heard = [(key, kind, payload) for key, kind, payload in everything if key != "fleetmap/farm/robots/r1/status"]
+    assert {key for key, _, _ in heard} == {"fleetmap/farm/events", f"0/topological_map_2/{STRING}"}
+    assert all(kind == zenoh.SampleKind.PUT for _, kind, _ in heard)
+    assert not [payload for _, _, payload in heard if payload in (b'{"sequence": 9999}', said(66))]
+    assert robot_of(api, "r2") is None
+    for key, expected in (("fleetmap/robots/*", []), ("fleetmap/server", ["fleetmap/server"])):
+        found = r2.liveliness().get(key, timeout=5.0)
+        assert [str(reply.ok.key_expr) for reply in found if reply.ok] == expected
+    answers = [bytes(reply.ok.payload) for reply in r2.get("fleetmap/farm/1/version", timeout=5.0) if reply.ok]
+    assert len(answers) == 1
+    assert json.loads(answers[0])["version"] == 1
+    for held in (*tokens, forged):
+        held.undeclare()  # type: ignore[no-untyped-call]
+
+
+def test_others_are_not_let_in(api: Api, port: int, authority: Authority, tmp_path: Path) -> None:
+    ca = authority.pem
+    refused(port, Login(ca, user="r1", password="word two"))
+    refused(port, Login(ca, user="stranger", password="word one"))
+    refused(port, Login(ca, user="server", password="server"))
+    refused(port, Login(ca))
+    refused(port, Login(Authority(tmp_path).pem, user="r1", password="word one"))  # the robot does not believe it
+    refused(port, Login(user="r1", password="word one"), "tcp")
+
+
+def test_what_is_kept_is_for_the_server_alone(api: Api) -> None:
+    folder = api.app.state.services.options.data_dir
+    for name in ("zenoh-password", "zenoh-users"):
+        assert stat.S_IMODE((folder / name).stat().st_mode) == 0o600
+    password = (folder / "zenoh-password").read_text()
+    assert len(password) > 40
+    assert f"server:{password}\n" in (folder / "zenoh-users").read_text()
+    assert not [p for p in folder.iterdir() if p.name.startswith("zenoh-users.")]
+    assert password not in api.get("/readyz").text
+
+
+class Wire:
+    """A link between a robot and the router, with somebody who listens to it."""
+
+    def __init__(self, port: int) -> None:
+        self.heard = bytearray()
+        self._to = port
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._server.getsockname()[1]
+        self._threads = [threading.Thread(target=self._accept, daemon=True)]
+        self._threads[0].start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._server.accept()
+                far = socket.create_connection(("127.0.0.1", self._to))
+                for a, b in ((near, far), (far, near)):
+                    self._threads.append(threading.Thread(target=self._pass, args=(a, b), daemon=True))
+                    self._threads[-1].start()
+
+    def _pass(self, a: socket.socket, b: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := a.recv(2**16):
+                self.heard += data
+                b.sendall(data)
+        for end in (a, b):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._server.shutdown(socket.SHUT_RDWR)
+        self._server.close()
+        for thread in self._threads:
+            thread.join(10)
+
+
+def test_who_listens_on_the_wire_hears_nothing(api: Api, port: int, authority: Authority) -> None:
+    wire = Wire(port)
+    try:
+        with session_to(wire.port, Login(authority.pem, user="r1", password="word one")) as session:
+            ear = Listener(session, "fleetmap/farm/events")
+            ear.wait(lambda e: 2 in e.sequences())
+            session.put("fleetmap/farm/robots/r1/status", said(3))
+            eventually(lambda: (r := robot_of(api, "r1")) and r["version"] == 3)
+    finally:
+        wire.close()
+    assert len(wire.heard) > 2000
+    for word in (b"fleetmap", b"version.created", b"word one", b"r1"):
+        assert word not in wire.heard
+
+
+def test_robots_that_must_show_a_certificate(authority: Authority, tmp_path: Path) -> None:
+    """Without users: what a certificate opens is everything."""
+    port = free_port()
+    certificate, key = authority.sign("mutual")
+    settings = settings_for(
+        tmp_path / "data",
+        zenoh_mode="router",
+        zenoh_listen=f"tls/127.0.0.1:{port}",
+        zenoh_certificate=certificate,
+        zenoh_key=key,
+        zenoh_ca=authority.pem,
+        zenoh_mtls=True,
+    )
+    with running(settings) as api:
+        eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
+        api.post("environments", {"name": "farm"})
+        refused(port, Login(authority.pem))
+        refused(port, Login(authority.pem, *Authority(tmp_path / "others", "ca").sign("robot")))
+        with session_to(port, Login(authority.pem, *authority.sign("robot"))) as session:
+            Listener(session, "fleetmap/farm/events").wait(lambda e: e.sequences() == [1])
+
+
+def test_the_server_is_a_user_of_somebody_elses_router(authority: Authority, tmp_path: Path) -> None:
+    port = free_port()
+    where = f"tls/127.0.0.1:{port}"
+    certificate, key = authority.sign("router")
+    (tmp_path / "users").write_text("maps:of all\nr1:one\n")
+    theirs = Security(Login(authority.pem, certificate, key), users=tmp_path / "users", folder=tmp_path)
+    config = json.loads(router_configuration(BusOptions(listen=where, security=theirs)))
+    config["access_control"]["enabled"] = False  # their rules know their users
+    router = Router(json.dumps(config))
+    assert router.problem is None
+    try:
+        settings: dict[str, Any] = {"zenoh_mode": "client", "zenoh_connect": where, "zenoh_ca": authority.pem}
+        with running(settings_for(tmp_path / "a", **settings, zenoh_user="maps", zenoh_password="of all")) as api:
+            eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
+            api.post("environments", {"name": "farm"})
+            with session_to(port, Login(authority.pem, user="r1", password="one")) as session:
+                Listener(session, "fleetmap/farm/events").wait(lambda e: e.sequences() == [1])
+        wrong = BusOptions(
+            mode="client", connect=where, security=Security(Login(authority.pem, user="maps", password="of none"))
+        )
+        quick = json.loads(session_configuration(wrong))
+        quick["connect"]["timeout_ms"] = int(REFUSED_SECONDS * 1000)
+        with pytest.raises(zenoh.ZError), zenoh.open(zenoh.Config.from_json5(json.dumps(quick))):
+            pass
+    finally:
+        router.close()
+
+
+# --- what an operator writes ----------------------------------------------------------------------------------------
+def test_a_file_of_users(tmp_path: Path) -> None:
+    path = tmp_path / "users"
+    path.write_bytes(b"# robots\r\nr1: one two \r\n\r\nr-2.x:a:b#c\n")
+    assert read_users(path) == {"r1": "one two", "r-2.x": "a:b#c"}
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [(b"", "no user"), (b"# x\n", "no user"), (b"r1\n", "line 1: not NAME"), (b"r1:\n", "line 1: not NAME"),
+     (b"a:b\nr/1:x\n", "line 2: a name"), (b"*:x", "a name"), (b"server:x", "the server's own"),
+     (b"a:b\na:c", "line 2: this name"), (b"a:\xff", "UTF-8"), (b"a:b\x00c", "not NAME"),
+     (b"a:b\n" * 300_000, "bytes")],
+)  # fmt: skip
+def test_what_is_no_file_of_users(text: bytes, told: str, tmp_path: Path) -> None:
+    path = tmp_path / "users"
+    path.write_bytes(text)
+    with pytest.raises(Invalid, match=told):
+        read_users(path)
+
+
+def test_a_missing_file_is_told_before_the_start(tmp_path: Path) -> None:
+    gone = tmp_path / "gone.pem"
+    here = tmp_path / "here.pem"
+    here.touch()
+    for security in (
+        Security(Login(ca=gone)),
+        Security(Login(certificate=gone, key=here)),
+        Security(Login(certificate=here, key=gone)),
+        Security(users=gone, folder=tmp_path),
+    ):
+        with pytest.raises(Invalid, match=r"gone\.pem cannot be read"):
+            check_bus(BusOptions(security=security))
+    for login in (Login(certificate=here), Login(key=here), Login(user="a"), Login(password="a")):
+        with pytest.raises(Invalid, match="the other way round"):
+            check_bus(BusOptions(mode="client", connect="tcp/x:1", security=Security(login)))
+    with pytest.raises(Unavailable, match="FLEETMAP_ZENOH_CONFIG"):
+        check_bus(BusOptions(config=gone))
+    assert "secret" not in repr(Login(user="a", password="secret"))
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        ({"zenoh_certificate": "a"}, "go together"), ({"tls_key": "a"}, "go together"),
+        ({"zenoh_listen": "tls/0.0.0.0:7447"}, "needs zenoh_certificate"),
+        ({"zenoh_certificate": "a", "zenoh_key": "b"}, "encrypted endpoints"),
+        ({"zenoh_user": "a"}, "go together"), ({"zenoh_mtls": True}, "zenoh_mtls needs"),
+        ({"zenoh_mode": "client", "zenoh_connect": "tcp/x:1", "zenoh_users": "u"}, "its own users"),
+        ({"zenoh_connect": "tcp/x:1", "zenoh_users": "u"}, "what other routers may say"),
+    ],
+)  # fmt: skip
+def test_settings_that_do_not_fit(more: dict[str, Any], told: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=told):
+        settings_for(tmp_path, **{"zenoh_mode": "router", **more})
+
+
+def test_access_control_of_the_operators_wins(tmp_path: Path) -> None:
+    users = tmp_path / "users"
+    users.write_text("r1:one\n")
+    security = Security(users=users, folder=tmp_path)
+    ours = json.loads(router_configuration(BusOptions(prefix="a/b", security=security)))["access_control"]
+    assert ours["default_permission"] == "deny"
+    assert [key for rule in ours["rules"][3:] for key in rule["key_exprs"]] == [
+        "a/b/*/robots/r1/status",
+        "a/b/robots/r1",
+    ]
+    config = tmp_path / "zenoh.json5"
+    theirs = {**access_control("x", ["r1"]), "default_permission": "allow"}
+    config.write_text(json.dumps({"access_control": theirs}))
+    made = json.loads(router_configuration(BusOptions(security=security, config=config)))
+    assert made["access_control"]["default_permission"] == "allow"
+    assert made["transport"]["auth"]["usrpwd"]["dictionary_file"] == str(tmp_path / "zenoh-users")
+
+
+def test_processes_that_start_at_once_have_one_password(tmp_path: Path) -> None:
+    users = tmp_path / "users"
+    users.write_text("r1:one\n")
+    options = BusOptions(security=Security(users=users, folder=tmp_path))
+    found: list[str] = []
+    barrier = threading.Barrier(8)
+
+    def start() -> None:
+        barrier.wait()
+        found.append(json.loads(session_configuration(options))["transport"]["auth"]["usrpwd"]["password"])
+
+    threads = [threading.Thread(target=start) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert len(found) == 8
+    assert len(set(found)) == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["users", "zenoh-password"]
