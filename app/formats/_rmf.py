@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
@@ -16,9 +17,11 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import _yaml
+from app.formats import WriteContext, _yaml
+from app.formats._network import natural
 from app.model.features import Properties
 from app.model.frame import MAX_METRES
+from app.parameters import parameter
 
 BUILDING, NAV_GRAPH = "openrmf", "rmf_nav_graph"
 """The families: under these names stands what only a building or a navigation graph knows of an item."""
@@ -149,6 +152,89 @@ def ends(geometry: Any) -> Array:
     """float64 [2, 2]: first and last point of a line."""
     at: Array = shapely.get_coordinates(geometry)
     return at[[0, -1]]
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What a building or its graphs say where no source does."""
+
+    building: str | None = parameter(None, "name of a building that no source names; default: the map's")
+    chargers: tuple[str, ...] | None = parameter(
+        None, "nodes (ids or names, separated by commas) that are chargers, parking spots and holding points"
+    )
+    robot_name: str | None = parameter(
+        None, "robots start at chargers that name none, called by this and a number: tractor_1 …; default: none start"
+    )
+    robot_type: str = parameter("TinyRobot", "model of robots whose charger names none")
+    graph: int = parameter(0, "graph of new lanes", minimum=0, maximum=MAX_GRAPHS - 1)
+    speed_limit: float = parameter(
+        0.0, "of new lanes whose edge has none; 0: no limit", minimum=0.0, maximum=100.0, unit="m/s"
+    )
+
+
+CHARGER = ("is_charger", "is_parking_spot", "is_holding_point")
+ROBOT, ROBOT_TYPE = "spawn_robot_name", "spawn_robot_type"
+
+
+class Robots:
+    """Chargers and the robots that start at them, as far as the options say and the sources do not."""
+
+    def __init__(self, options: WriteOptions, nodes: Iterable[tuple[str, str, Properties]]) -> None:
+        """nodes: (level, id, properties) of all of them."""
+        self._options = options
+        self._more: dict[tuple[str, str], dict[str, Any]] = {}
+        self._unknown: list[str] = []
+        if options.chargers or options.robot_name is not None:
+            self._find(sorted(nodes, key=lambda node: (node[0], natural(node[1]))))
+
+    def _find(self, nodes: Sequence[tuple[str, str, Properties]]) -> None:
+        wanted = {name.strip() for name in self._options.chargers or ()} - {""}
+        said = [_vertex_says(p) for _, _, p in nodes]
+        taken = {str(known[ROBOT]) for known in said if known.get(ROBOT)}
+        met: set[str] = set()
+        number = 0
+        for (level, i, p), known in zip(nodes, said, strict=True):
+            names = wanted & {i, str(p.get("name"))}
+            met |= names
+            more: dict[str, Any] = {word: True for word in CHARGER if names and word not in known}
+            charger = bool(names) or known.get(CHARGER[0]) is True
+            if charger and not known.get(ROBOT) and self._options.robot_name is not None:
+                number += 1
+                while f"{self._options.robot_name}_{number}" in taken:
+                    number += 1
+                more[ROBOT] = f"{self._options.robot_name}_{number}"
+                if not known.get(ROBOT_TYPE):
+                    more[ROBOT_TYPE] = self._options.robot_type
+            if more:
+                self._more[level, i] = more
+        self._unknown = sorted(wanted - met)
+
+    def at(self, level: str, i: str) -> dict[str, Any]:
+        """What a vertex' parameters say more, by word."""
+        return self._more.get((level, i), {})
+
+    def report(self, context: WriteContext) -> None:
+        """Declare what was filled in, and which nodes there are not."""
+        many = list(self._more.values())
+        if made := sum(CHARGER[0] in more for more in many):
+            context.fill("vertices: " + ", ".join(CHARGER), True, f"{made} nodes do not say it", "chargers")
+        if names := sorted((str(more[ROBOT]) for more in many if ROBOT in more), key=natural):
+            why = f"{len(names)} chargers name no robot"
+            context.fill(f"vertices: {ROBOT}", names if len(names) <= 20 else [*names[:20], "…"], why, "robot_name")
+            context.fill(f"vertices: {ROBOT_TYPE}", self._options.robot_type, why, "robot_type")
+        if self._unknown:
+            context.warn(
+                f"no node is called {', '.join(self._unknown[:5])}: no charger is made of it", where="chargers"
+            )
+
+
+def _vertex_says(p: Properties) -> dict[str, Any]:
+    """A vertex' parameters without their types."""
+    graph, building = p.get(NAV_GRAPH), p.get(BUILDING)
+    plain = graph.get("parameters") if isinstance(graph, Mapping) else None
+    typed_ = building.get("parameters") if isinstance(building, Mapping) else None
+    out = dict(plain) if isinstance(plain, Mapping) else {}
+    return out | ({key: value_of(typed_, key) for key in typed_} if isinstance(typed_, Mapping) else {})
 
 
 class Flow:

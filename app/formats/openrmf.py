@@ -757,6 +757,8 @@ class _Writer:
         why: str,
     ) -> None:
         self.layers, self.context, self.storeys, self.system = layers, context, storeys, system
+        self.options = context.options if isinstance(context.options, _rmf.WriteOptions) else _rmf.WriteOptions()
+        self.robots = _rmf.Robots(self.options, _nodes_of(storeys))
         self.building = dict(building)
         self.resources = resources
         self.why = why
@@ -797,9 +799,10 @@ class _Writer:
         top = {key: value for key, value in self.building.items() if key not in ("levels", "lifts")}
         if "name" not in top and "building_name" not in top:
             said = self._graph_name()
-            top["name"] = self.context.title if said is None else said
+            usual = self.options.building or self.context.title
+            top["name"] = usual if said is None else said
             if said is None:
-                self.context.fill("name", self.context.title, "no source names the building")
+                self.context.fill("name", usual, "no source names the building", "building")
         if self.system != IMAGE or "coordinate_system" in top:
             top["coordinate_system"] = self.system
         if "reference_level_name" in top and _text(top["reference_level_name"]) not in self.transforms:
@@ -912,7 +915,7 @@ class _Writer:
                 known = isinstance(at, int)
                 key = (not known, at if isinstance(at, int) else 0, len(part.ids[k]), part.ids[k])
                 height = 0.0 if math.isnan(high) else high - elevation
-                row = self._vertex(part.ids[k], p, place, height)
+                row = self._vertex(part.ids[k], p, place, height, self.robots.at(storey.name, part.ids[k]))
                 found.append((key, row))
         found.sort(key=lambda item: item[0])
         ids: dict[str, int] = {}
@@ -923,7 +926,7 @@ class _Writer:
                 old.setdefault(was, k)
         return _Vertices([row for _, row in found], old), ids
 
-    def _vertex(self, i: str, p: Properties, place: tuple[str, str], z: float) -> str:
+    def _vertex(self, i: str, p: Properties, place: tuple[str, str], z: float, further: Mapping[str, Any]) -> str:
         rest = own(p, NAME)
         said = p.get("name")
         parameters = rest.get("parameters")
@@ -936,6 +939,8 @@ class _Writer:
             self.lost["nodes' attributes of other formats"] += any(
                 isinstance(v, dict) for key, v in p.items() if key != NAV_GRAPH
             )
+        if further:
+            parameters = {**(parameters or {}), **{key: _rmf.typed(value) for key, value in further.items()}}
         self.lost["nodes' orientations"] += p.get("orientation") is not None
         row = f"[{place[0]}, {place[1]}, {_yaml.text(round(z, METRES) + 0.0)}, {_yaml.text(name)}"
         if parameters or rest.get("more"):
@@ -973,11 +978,12 @@ class _Writer:
             rest = own(p, NAME)
             if NAME not in p:
                 self.made["lanes"] += NAV_GRAPH not in p
-                rest = {"parameters": _lane_parameters(p)}
+                rest = {"parameters": _lane_parameters(p, self.options)}
                 self.lost["edges' attributes of other formats"] += any(
                     isinstance(v, dict) for key, v in p.items() if key != NAV_GRAPH
                 )
-            yield _Lane.of(p, rest, source, target, self.flow)
+            limit = _rmf.limit(p) or (self.options.speed_limit if NAME not in p and NAV_GRAPH not in p else 0.0)
+            yield _Lane.of(limit, rest, source, target, self.flow)
 
     def _dangling(self, storey: _Storey, vertices: _Vertices, sections: Sections) -> None:
         """Rows to vertices that did not exist come back where they still do not."""
@@ -1130,8 +1136,12 @@ class _Writer:
         for what, count in sorted(self.lost.items()):
             self.context.drop(what, count, "a building in these coordinates has no place for it")
         if self.made["lanes"]:
-            fill = {key: value[1] for key, value in LANE_TEMPLATE.items()}
-            self.context.fill("lanes: parameters", fill, f"{self.made['lanes']} edges come from another format")
+            why = f"{self.made['lanes']} edges come from another format"
+            self.context.fill("lanes: graph_idx", self.options.graph, why, "graph")
+            limited = f"{why}, where they have none"
+            self.context.fill("lanes: speed_limit", self.options.speed_limit, limited, "speed_limit")
+            self.context.fill("lanes: orientation", LANE_TEMPLATE["orientation"][1], why)
+        self.robots.report(self.context)
         if self.made["doors"]:
             said = {key: value[1] for key, value in DOOR_TEMPLATE.items()}
             self.context.fill("doors: parameters", said, f"{self.made['doors']} doors come from a navigation graph")
@@ -1171,9 +1181,19 @@ def _in_order(parts: Sequence[Features]) -> Iterable[tuple[str, Properties, int]
     return each() if all(a <= b for a, b in pairwise(map(key, each()))) else sorted(each(), key=key)
 
 
-def _lane_parameters(p: Properties) -> dict[str, Any]:
+def _nodes_of(storeys: Iterable[_Storey]) -> Iterator[tuple[str, str, Properties]]:
+    for storey in storeys:
+        for part in storey.networks:
+            for i, p in zip(part.ids, part.properties, strict=True):
+                if p.get("kind") == "node":
+                    yield storey.name, i, p
+
+
+def _lane_parameters(p: Properties, options: _rmf.WriteOptions) -> dict[str, Any]:
     """The parameters of a lane that comes from another format."""
     out = {key: list(value) for key, value in LANE_TEMPLATE.items()}
+    if NAV_GRAPH not in p:
+        out["graph_idx"] = [2, options.graph]
     graph = own(p, NAV_GRAPH)
     said = mapping(graph.get("parameters"), "parameters")
     if isinstance(graph.get("graph"), int):
@@ -1201,12 +1221,11 @@ class _Lane:
     both: bool = False
 
     @classmethod
-    def of(cls, p: Properties, rest: Mapping[str, Any], source: int, target: int, flow: Flow) -> _Lane:
-        """The edge with these properties; rest: what is known of its lane."""
+    def of(cls, limit: float, rest: Mapping[str, Any], source: int, target: int, flow: Flow) -> _Lane:
+        """The edge with this speed limit (0: none); rest: what is known of its lane."""
         was = rest.get("index") if isinstance(rest.get("index"), int) else None
         reverse = rest.get("reverse") is True
         parameters = mapping(rest.get("parameters"), "parameters")
-        limit = _rmf.limit(p)
         said = value_of(parameters, "speed_limit", 0.0)
         if (said if isinstance(said, (int, float)) and said > 0 else 0.0) != limit:
             parameters = {**parameters, "speed_limit": [3, limit]}
@@ -1287,6 +1306,7 @@ register(
         companions=companions,
         family=NAME,
         rank=40,
+        write_options=_rmf.WriteOptions,
         extensions=(".building.yaml", ".yaml", ".yml"),
         choose=choose,
     )

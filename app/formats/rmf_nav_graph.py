@@ -322,7 +322,11 @@ class _Writer:
         self.lost: Counter[str] = Counter()
         self.building, self.tops = self._documents()
         self.doors, self.lifts = self._doors(), self._lifts()
+        self.options = context.options if isinstance(context.options, _rmf.WriteOptions) else _rmf.WriteOptions()
         self.storeys = self._storeys()
+        nodes = ((s.name, i, p) for s in self.storeys for i, p in zip(s.ids, s.nodes, strict=True))
+        self.robots = _rmf.Robots(self.options, nodes)
+        self.new_lanes = 0
 
     def _documents(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """What a building says at its top level, and what each graph does."""
@@ -346,6 +350,13 @@ class _Writer:
             )
         out = {f"{graph}.yaml": self._graph(graph).encode() for graph in graphs}
         self._count_left_out()
+        if self.new_lanes:
+            why = f"{self.new_lanes} edges come from another format"
+            self.context.fill("lanes: graph", self.options.graph, why, "graph")
+            if self.options.speed_limit:
+                limited = f"{why}, where they have none"
+                self.context.fill("lanes: speed_limit", self.options.speed_limit, limited, "speed_limit")
+        self.robots.report(self.context)
         for what, count in sorted(self.lost.items()):
             self.context.drop(what, count, "a navigation graph has no place for it")
         if self.building.get("coordinate_system") in ("wgs84", "web_mercator"):
@@ -478,7 +489,7 @@ class _Writer:
                 if p.get("kind") == "node":
                     continue
                 source, target = places.get(str(p.get("source"))), places.get(str(p.get("target")))
-                graph = _graph_of(p)
+                graph = self.options.graph if NAME not in p and BUILDING not in p else _graph_of(p)
                 if p.get("kind") != "edge" or source is None or target is None:
                     self.lost["edges without two nodes on their level"] += 1
                 elif graph is None:
@@ -507,9 +518,10 @@ class _Writer:
         top = dict(mapping(self.tops.get(str(graph)), "graphs"))
         if "building_name" not in top:
             name = self.building.get("building_name", self.building.get("name"))
-            top["building_name"] = self.context.title if name is None else name
+            usual = self.options.building or self.context.title
+            top["building_name"] = usual if name is None else name
             if name is None:
-                self.context.fill("building_name", self.context.title, "no source names the building")
+                self.context.fill("building_name", usual, "no source names the building", "building")
         if self.building.get("coordinate_system") == "cartesian_meters":
             parameters = self.building.get("parameters")
             top.setdefault("offset", [value_of(parameters, key, 0) for key in ("offset_x", "offset_y")])
@@ -546,7 +558,7 @@ class _Writer:
         texts = list(map(_yaml.decimal, numbers(storey.at[order].ravel(), METRES)))
         vertices = []
         for n, k in enumerate(order):
-            said = self._vertex(storey, k)
+            said = {**self._vertex(storey, k), **self.robots.at(storey.name, storey.ids[k])}
             names[str(said["name"])] += bool(said.get("name"))
             more = "".join(f", {self.flow(v)}" for v in own(storey.nodes[k], NAME).get("more") or ())
             vertices.append(f"      - [{texts[2 * n]}, {texts[2 * n + 1]}, {self.flow(said)}{more}]\n")
@@ -602,6 +614,9 @@ class _Writer:
                 said["is_bidirectional"] = False
             return said
         said = {}
+        if BUILDING not in e.p:
+            self.new_lanes += 1
+            limit = limit or self.options.speed_limit
         if door is not None:
             said["door_name"] = door
         if limit:
@@ -736,6 +751,7 @@ register(
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"objects"})),
         family=NAME,
         rank=30,
+        write_options=_rmf.WriteOptions,
         extensions=(".yaml", ".yml"),
         choose=choose,
         joined=True,

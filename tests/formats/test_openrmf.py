@@ -40,8 +40,8 @@ def read(files: dict[str, bytes] | str, **context: Any) -> tuple[Layers, ReadCon
     return formats.read(Group(FORMAT, main, given), told), told
 
 
-def write(layers: Layers) -> tuple[dict[str, Any], dict[str, bytes], WriteContext]:
-    told = WriteContext()
+def write(layers: Layers, **options: Any) -> tuple[dict[str, Any], dict[str, bytes], WriteContext]:
+    told = WriteContext(options=formats.write_options(FORMAT, options))
     files = formats.write(FORMAT, layers, told)
     return yaml.safe_load(files["building.yaml"]), files, told
 
@@ -292,7 +292,22 @@ def test_a_network_of_another_format_is_written_in_metres() -> None:
         "speed_limit": [3, 0],
     }
     assert {line["what"] for line in told.dropped} >= {"edges' widths", "nodes' attributes of other formats"}
-    assert {line["what"] for line in told.template} == {"name", "lanes: parameters"}
+    filled = {line["what"]: line["value"] for line in told.template}
+    assert filled == {"name": "map", "lanes: graph_idx": 0, "lanes: speed_limit": 0.0, "lanes: orientation": ""}
+    wish = {"chargers": "n1", "robot_name": "tractor", "graph": 2, "speed_limit": 0.8, "building": "Barn"}
+    said, _, told = write(Layers({key: features(rows, "wgs84")}, here), **wish)
+    level = said["levels"]["ground"]
+    assert said["name"] == "Barn"
+    assert level["vertices"][1][4] == {
+        "is_charger": [4, True],
+        "is_holding_point": [4, True],
+        "is_parking_spot": [4, True],
+        "spawn_robot_name": [1, "tractor_1"],
+        "spawn_robot_type": [1, "TinyRobot"],
+    }
+    assert [lane[2]["speed_limit"] for lane in level["lanes"]] == [[3, 1.5], [3, 0.8]]
+    assert {lane[2]["graph_idx"][1] for lane in level["lanes"]} == {2}
+    assert {line["option"] for line in told.template if "option" in line} == {*wish, "robot_type"}
 
 
 def test_a_network_on_a_level_of_its_own_stands_beside_a_building_in_pixels() -> None:

@@ -36,8 +36,8 @@ def read(files: dict[str, bytes] | str) -> tuple[Layers, ReadContext]:
     return formats.read(Group(FORMAT, next(iter(given)), given), told), told
 
 
-def write(layers: Layers) -> tuple[dict[str, Any], WriteContext]:
-    told = WriteContext()
+def write(layers: Layers, **options: Any) -> tuple[dict[str, Any], WriteContext]:
+    told = WriteContext(options=formats.write_options(FORMAT, options))
     files = formats.write(FORMAT, layers, told)
     return {name: yaml.safe_load(data) for name, data in files.items()}, told
 
@@ -205,7 +205,52 @@ def test_a_network_of_another_format_is_graph_0_with_its_ids_as_names() -> None:
     ]
     dropped = {line["what"]: line["count"] for line in told.dropped}
     assert dropped == {"edges' actions": 3, "nodes without lanes": 1, "nodes' attributes of other formats": 1}
-    assert [line["what"] for line in told.template] == ["building_name"]
+    assert [(line["what"], line["option"]) for line in told.template] == [
+        ("building_name", "building"),
+        ("lanes: graph", "graph"),
+    ]
+
+
+def test_robots_and_lanes_that_no_source_tells_of() -> None:
+    rows: list[Any] = [(i, shapely.Point(k, 0), {"kind": "node"}) for k, i in enumerate(("a", "b10", "b9"))]
+    line = shapely.LineString([(0, 0), (1, 0)])
+    rows += [(f"{a}_{b}", line, {"kind": "edge", "source": a, "target": b}) for a, b in (("a", "b9"), ("a", "b10"))]
+    layers = Layers({PartKey("topology", "ground", "network"): features(rows, "local")})
+    wish = {"chargers": "b10, b9,nowhere", "robot_name": "mower", "robot_type": "Mower", "graph": "3"}
+    said, told = write(layers, **wish, speed_limit="0.7", building="Farm")
+    assert list(said) == ["3.yaml"]
+    assert said["3.yaml"]["building_name"] == "Farm"
+    level = said["3.yaml"]["levels"]["ground"]
+    here = {v[2]["name"]: v[2] for v in level["vertices"]}
+    charger = {"is_charger": True, "is_parking_spot": True, "is_holding_point": True, "spawn_robot_type": "Mower"}
+    assert here["b9"] == {"name": "b9", **charger, "spawn_robot_name": "mower_1"}
+    assert here["b10"] == {"name": "b10", **charger, "spawn_robot_name": "mower_2"}
+    assert here["a"] == {"name": "a"}
+    assert {lane[2]["speed_limit"] for lane in level["lanes"]} == {0.7}
+    filled = {line["option"]: line["value"] for line in told.template}
+    assert filled["robot_name"] == ["mower_1", "mower_2"]
+    assert (filled["robot_type"], filled["graph"], filled["speed_limit"]) == ("Mower", 3, 0.7)
+    assert [w.problem for w in told.warnings if "nowhere" in w.problem]
+    # A source's own chargers get only the robots that they do not name.
+    stored, _ = read(CHARGERS)
+    own, _ = write(stored, robot_name="nurse", chargers="c")
+    at = own["0.yaml"]["levels"]["L"]["vertices"]
+    assert [v[2].get("spawn_robot_name") for v in at] == ["nurse_1", "nurse_2", "nurse_3"]
+    assert "spawn_robot_type" not in at[0][2], "a robot that a source names is its own matter"
+    plain, told = write(stored)
+    assert plain["0.yaml"]["levels"]["L"]["vertices"][1][2] == {"name": "b", "is_charger": True}
+    assert not [line for line in told.template if "robot" in line["what"]]
+
+
+CHARGERS = """building_name: x
+levels:
+  L:
+    vertices:
+    - [0, 0, {name: a, is_charger: true, spawn_robot_name: nurse_1}]
+    - [1, 0, {name: b, is_charger: true}]
+    - [2, 0, {name: c}]
+    lanes: [[0, 1, {}], [1, 2, {}]]
+"""
 
 
 def test_a_level_without_vertices_stays_a_level() -> None:
