@@ -7,6 +7,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,31 +21,81 @@ from app.model import solids
 from app.model.features import Feature
 from app.model.frame import is_writable
 from app.model.grid import UNKNOWN, OccupancyGrid
+from app.parameters import parameter
 
 PLATE = 0.02
 """Thickness in metres of what is only drawn on the ground."""
 
-FLOOR = 0.1
-THICKNESS = 0.1
-"""Metres of a floor's slab and of a wall that tells no width."""
-
-DOOR_HEIGHT = 2.1
-POLE = (0.05, 2.0)
-"""Radius and height in metres of an obstacle of which only the place is known."""
-
-HEIGHTS: Mapping[str, float] = {"barrier": 1.2, "fence": 1.2, "hedge": 1.2, "obstacle": 1.0, "tree": 3.0, "pole": 2.0}
-"""Metres, of kinds that stand in the way and tell no height; walls and buildings have parameters."""
+HEIGHTS: Mapping[str, str] = {
+    "wall": "wall_height",
+    "building": "building_height",
+    **dict.fromkeys(("barrier", "fence", "hedge"), "barrier_height"),
+    "obstacle": "obstacle_height",
+    "tree": "tree_height",
+    "pole": "pole_height",
+}
+"""Of kinds that stand in the way and may tell no height, the parameter that does."""
 
 DRAWN = frozenset({"region", "zone", "area", "door"})
 """Kinds that are seen and not felt."""
 
 COLOURS: Mapping[str, str] = {
-    "building": "0.75 0.68 0.6 1",
-    "wall": "0.7 0.7 0.7 1",
-    "floor": "0.8 0.8 0.78 1",
-    "door": "0.5 0.35 0.2 1",
-    "region": "0.45 0.65 0.4 1",
+    "building": "building_colour",
+    "wall": "wall_colour",
+    "floor": "floor_colour",
+    "door": "door_colour",
+    "region": "area_colour",
 }
+"""Of kinds that have a colour where they tell none, the parameter that does."""
+
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Usual:
+    """What bodies get that no source tells."""
+
+    wall_height: float = parameter(2.5, "height of walls that tell none", minimum=0.01, maximum=1000.0, unit="m")
+    building_height: float = parameter(
+        6.0, "height of buildings that tell none", minimum=0.01, maximum=1000.0, unit="m"
+    )
+    barrier_height: float = parameter(
+        1.2, "height of barriers, fences and hedges that tell none", minimum=0.01, maximum=1000.0, unit="m"
+    )
+    obstacle_height: float = parameter(
+        1.0, "height of obstacles that tell none", minimum=0.01, maximum=1000.0, unit="m"
+    )
+    tree_height: float = parameter(3.0, "height of trees that tell none", minimum=0.01, maximum=1000.0, unit="m")
+    pole_height: float = parameter(2.0, "height of poles that tell none", minimum=0.01, maximum=1000.0, unit="m")
+    door_height: float = parameter(2.1, "height of doors that tell none", minimum=0.01, maximum=1000.0, unit="m")
+    wall_thickness: float = parameter(
+        0.1, "of walls and other lines that tell no width", minimum=0.001, maximum=100.0, unit="m"
+    )
+    floor_thickness: float = parameter(0.1, "of floors that tell no height", minimum=0.001, maximum=100.0, unit="m")
+    pole_radius: float = parameter(
+        0.05, "of obstacles of which only the place is known", minimum=0.001, maximum=100.0, unit="m"
+    )
+    building_colour: tuple[float, float, float] = parameter(
+        (0.75, 0.68, 0.6), "colour of buildings: red, green, blue", minimum=0.0, maximum=1.0
+    )
+    wall_colour: tuple[float, float, float] = parameter(
+        (0.7, 0.7, 0.7), "colour of walls: red, green, blue", minimum=0.0, maximum=1.0
+    )
+    floor_colour: tuple[float, float, float] = parameter(
+        (0.8, 0.8, 0.78), "colour of floors: red, green, blue", minimum=0.0, maximum=1.0
+    )
+    door_colour: tuple[float, float, float] = parameter(
+        (0.5, 0.35, 0.2), "colour of doors: red, green, blue", minimum=0.0, maximum=1.0
+    )
+    area_colour: tuple[float, float, float] = parameter(
+        (0.45, 0.65, 0.4), "colour of areas drawn on the ground: red, green, blue", minimum=0.0, maximum=1.0
+    )
+    ground_colour: tuple[float, float, float] = parameter(
+        (0.8, 0.8, 0.8), "colour of the ground: red, green, blue", minimum=0.0, maximum=1.0
+    )
+    ground: bool = parameter(True, "a plane to stand on, where a world is made")
+    sun: bool = parameter(True, "a light, where a world is made that has none")
+
 
 LARGEST_GROUND = 1e5
 
@@ -90,22 +141,18 @@ def sun(name: str) -> etree._Element:
 class Bodies:
     """Makes models, collects the files they need, and tells what was made up and what was left out."""
 
-    def __init__(
-        self, context: WriteContext, resources: Mapping[str, bytes], wall_height: float, building_height: float
-    ) -> None:
-        self.context, self.resources = context, resources
-        self.heights = {**HEIGHTS, "wall": wall_height, "building": building_height}
+    def __init__(self, context: WriteContext, resources: Mapping[str, bytes], usual: Usual) -> None:
+        self.context, self.resources, self.usual = context, resources, usual
         self.files: dict[str, bytes] = {}
         self.newest = (1, 4)
-        self._wall_height = wall_height
-        self._filled: Counter[tuple[str, float, str]] = Counter()
+        self._filled: set[tuple[str, float | Colour, str, str]] = set()
         self._lost: Counter[tuple[str, str]] = Counter()
         self._box: list[tuple[float, float, float, float]] = []
 
     def report(self) -> None:
         """Declare what was filled in and dropped so far."""
-        for (what, value, why), _ in sorted(self._filled.items()):
-            self.context.fill(what, value, why)
+        for what, value, why, option in sorted(self._filled, key=lambda told: (told[0], told[2])):
+            self.context.fill(what, list(value) if isinstance(value, tuple) else value, why, option or None)
         for (what, why), count in sorted(self._lost.items()):
             self.context.drop(what, count, why)
         self._filled.clear()
@@ -132,6 +179,12 @@ class Bodies:
         name = free_name(name if isinstance(name, str) and name else one.id, taken)
         self._measure(one.geometry)
         return self._static(name, pose, shapes, COLOURS.get(kind), said.get("gazebo"))
+
+    def _taken(self, what: str, option: str, why: str = "the objects tell none") -> float:
+        """A measure that the options say; it is declared."""
+        value = float(getattr(self.usual, option))
+        self._filled.add((what, value, why, option))
+        return value
 
     def _measure(self, geometry: Any) -> None:
         box = shapely.bounds(geometry)
@@ -173,18 +226,17 @@ class Bodies:
         if not height and _is_size(size) and size is not None:
             height = float(size[2])
         drawn = kind in DRAWN and not height
-        if not height and kind in self.heights:
-            height = self.heights[kind]
-            self._filled[f"height of {kind}", height, "the objects tell none"] += 1
+        if not height and kind in HEIGHTS:
+            height = self._taken(f"height of {kind}", HEIGHTS[kind])
         if kind == "floor" and not height:
-            base, height = base - FLOOR, FLOOR
-            self._filled["thickness of floor", FLOOR, "the objects tell none"] += 1
+            height = self._taken("thickness of floor", "floor_thickness")
+            base -= height
         if kind == "door" and drawn:
-            height = DOOR_HEIGHT
-            self._filled["height of door", height, "the objects tell none; doors stand open: nothing collides"] += 1
+            why = "the objects tell none; doors stand open: nothing collides"
+            height = self._taken("height of door", "door_height", why)
         if drawn and not height:
             height = PLATE
-            self._filled[f"height of {kind}", PLATE, "drawn on the ground, nothing collides with it"] += 1
+            self._filled.add((f"height of {kind}", PLATE, "drawn on the ground, nothing collides with it", ""))
         geometry = one.geometry
         if shapely.is_empty(geometry) or not height:
             return [], []
@@ -202,8 +254,7 @@ class Bodies:
             elif dimension == 1:
                 width = _positive(said.get("width"), 0.0)
                 if not width:
-                    width = THICKNESS
-                    self._filled[f"width of {kind}", width, "the objects tell none"] += 1
+                    width = self._taken(f"width of {kind}", "wall_thickness")
                 shapes += _segments(flat, height, width)
             elif dimension == 0:
                 shapes.append(self._post(flat, height, said))
@@ -220,13 +271,16 @@ class Bodies:
         yaw = float(pose[5]) if isinstance(pose, (list, tuple)) and len(pose) == 6 else 0.0
         if _is_size(size) and size is not None:
             return {"type": "box", "size": [*map(float, size[:2]), height], "pose": [x, y, height / 2, 0.0, 0.0, yaw]}
-        self._filled["radius of points", POLE[0], "the objects tell none"] += 1
-        return {"type": "cylinder", "radius": POLE[0], "length": height, "pose": [x, y, height / 2, 0.0, 0.0, yaw]}
+        radius = self._taken("radius of points", "pole_radius")
+        return {"type": "cylinder", "radius": radius, "length": height, "pose": [x, y, height / 2, 0.0, 0.0, yaw]}
 
     def _static(
         self, name: str, pose: Sequence[float], shapes: Sequence[Mapping[str, Any]], colour: str | None, own: Any
     ) -> etree._Element:
-        """A static model with a collision and a visual for each shape, or what of both it has."""
+        """A static model with a collision and a visual for each shape, or what of both it has.
+
+        colour: the parameter that says the colour of shapes that tell none, if one does.
+        """
         model = etree.Element("model", name=name)
         if any(pose):
             model.append(_sdf.pose_element(pose))
@@ -242,8 +296,18 @@ class Bodies:
                     part.append(_sdf.pose_element(shape["pose"]))
                 part.append(_sdf.geometry_element(shape, shape.get("uri")))
                 if tag == "visual":
-                    _material(part, _colour(shape) or colour, material)
+                    own_colour = _colour(shape)
+                    if own_colour is None and colour is not None and not _is_script(material):
+                        own_colour = self._tinted(colour)
+                    _material(part, own_colour, material)
         return model
+
+    def _tinted(self, option: str) -> str:
+        """A colour that the options say; it is declared."""
+        value: Colour = getattr(self.usual, option)
+        what = next((kind for kind, name in COLOURS.items() if name == option), option.removesuffix("_colour"))
+        self._filled.add((f"colour of {what}", value, "no source tells one", option))
+        return f"{value[0]:g} {value[1]:g} {value[2]:g} 1"
 
     # --- ground and walls ----------------------------------------------------------------------------------------
     @property
@@ -264,7 +328,7 @@ class Bodies:
         """A plane at height 0."""
         middle, size = self._ground()
         shape = {"type": "plane", "normal": [0.0, 0.0, 1.0], "size": size}
-        return self._static("ground_plane", [*middle, 0.0, 0.0, 0.0, 0.0], [shape], "0.8 0.8 0.8 1", None)
+        return self._static("ground_plane", [*middle, 0.0, 0.0, 0.0, 0.0], [shape], "ground_colour", None)
 
     def walls(self, grid: OccupancyGrid, name: str, threshold: int, elevation: float) -> etree._Element | None:
         """A grid's occupied cells as one static model, whose mesh lies in ``models/<name>/meshes``."""
@@ -273,8 +337,8 @@ class Bodies:
             self.context.warn(f"no cell has a value of {threshold} or more: there are no walls", where=name)
             return None
         file = f"{name}/meshes/{name}.stl"
-        self.files[f"{_sdf.MODELS}/{file}"] = stl(extruded(occupied, grid.resolution, self._wall_height))
-        self.context.fill("height of walls", self._wall_height, "a grid tells none")
+        self.files[f"{_sdf.MODELS}/{file}"] = stl(extruded(occupied, grid.resolution, self.usual.wall_height))
+        self.context.fill("height of walls", self.usual.wall_height, "a grid tells none", "wall_height")
         x, y, yaw = grid.origin
         corners = grid.corners()
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -293,9 +357,13 @@ def _colour(shape: Mapping[str, Any]) -> str | None:
     return _sdf.words([*said, 1.0][:4])
 
 
+def _is_script(material: Any) -> bool:
+    return isinstance(material, Mapping) and isinstance(material.get("name"), str)
+
+
 def _material(visual: etree._Element, colour: str | None, script: Any) -> None:
     """The colour of a kind, or the material script that a list names."""
-    if isinstance(script, Mapping) and isinstance(script.get("name"), str):
+    if _is_script(script):
         material = _sdf.child(_sdf.child(visual, "material"), "script")
         uri = script.get("uri")
         if isinstance(uri, str):

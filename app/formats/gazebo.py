@@ -67,7 +67,7 @@ SAME_POSE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class WriteOptions:
+class WriteOptions(_sdf_bodies.Usual):
     """Which world, and what is made of objects and grids that no world has told of."""
 
     world: str | None = parameter(
@@ -87,10 +87,6 @@ class WriteOptions:
     grid: str | None = parameter(None, "grid whose occupied cells become walls; default: map, else the only one")
     level: str | None = parameter(None, "level of the objects and the grid; default: all, and the grid's own")
     threshold: int = parameter(65, "cell value from which on a cell is a wall", minimum=1, maximum=100)
-    wall_height: float = parameter(2.5, "height of walls that tell none", minimum=0.01, maximum=1000.0, unit="m")
-    building_height: float = parameter(
-        6.0, "height of buildings that tell none", minimum=0.01, maximum=1000.0, unit="m"
-    )
 
 
 # --- telling -----------------------------------------------------------------------------------------------------
@@ -525,9 +521,7 @@ class _Writer:
         world = self._frame(chosen)
         for one in sorted(chosen.objects if chosen is not None else [], key=lambda o: _natural(o.id)):
             self._put_back(one)
-        bodies = _sdf_bodies.Bodies(
-            self.context, self.resources, self.options.wall_height, self.options.building_height
-        )
+        bodies = _sdf_bodies.Bodies(self.context, self.resources, self.options)
         self._make(bodies, [(self.options.level or GROUND, one) for one in self.loose])
         everything = self.options.content == "all" or (
             self.options.content == "auto" and not (chosen is not None and chosen.is_world)
@@ -542,7 +536,6 @@ class _Writer:
             self._make(bodies, rows)
         else:
             self.context.drop("objects of other formats", sum(len(p) for _, p in self.others), why)
-        bodies.report()
         for key, grid in self.layers.grids().items():
             told = any(other.level == key.level for other, _ in self.others)
             if self.options.grid is None and everything and told and _is_slice(grid):
@@ -556,6 +549,7 @@ class _Writer:
                 self.context.drop(f"walls of the grid {key.name}", 1, why)
         if chosen is None or not chosen.is_world:
             self._furnish(bodies)
+        bodies.report()
         self._place(world, chosen)
         world.extend([element for _, element in sorted(self.made, key=lambda row: _natural(row[0]))])
         return self._bundle(world, chosen, bodies)
@@ -622,14 +616,14 @@ class _Writer:
 
     def _furnish(self, bodies: _sdf_bodies.Bodies) -> None:
         """A ground to stand on and a light, where a world is made."""
-        if "ground_plane" not in self.taken:
+        if "ground_plane" not in self.taken and self.options.ground:
             self.made.append(("ground_plane", bodies.ground()))
-            self.context.fill("ground plane", bodies.ground_size, "no world tells of the ground")
+            self.context.fill("ground plane", bodies.ground_size, "no world tells of the ground", "ground")
         lit = any(e.tag == "light" or _sdf.text_of(e, "uri").lower().rstrip("/").endswith("sun") for _, e in self.made)
-        if not lit:
+        if not lit and self.options.sun:
             name = _sdf_bodies.free_name("sun", self.taken)
             self.made.append((name, _sdf_bodies.sun(name)))
-            self.context.fill("sun", "directional light", "no world tells of a light")
+            self.context.fill("sun", "directional light", "no world tells of a light", "sun")
 
     def _place(self, world: etree._Element, chosen: _Stored | None) -> None:
         """The datum as spherical coordinates; what the stored world says stays where it means the same."""

@@ -228,7 +228,11 @@ def test_an_orchard_from_a_list() -> None:
     assert len(made.findall("model[@name='tree']//collision")) == 1
     assert len(made.findall("model[@name='tree']//visual")) == 2
     assert made.findtext("model[@name='grass']//script/name") == "Gazebo/DarkGrey"
-    assert {t["what"] for t in answer.report["template"]} == {"ground plane", "sun"}
+    assert {t["what"]: t["option"] for t in answer.report["template"]} == {
+        "ground plane": "ground",
+        "colour of ground": "ground_colour",
+        "sun": "sun",
+    }
     assert [d["what"] for d in answer.report["dropped"]] == ["objects of kind model"]
 
 
@@ -605,11 +609,56 @@ def test_objects_of_other_formats_become_static_models() -> None:
     assert by["door"].properties["shapes"][0]["visual"] is True
     assert by["field"].properties["shapes"][0]["visual"] is True
     assert extent("bin") == (6.75, 6.7, 3, 7.25, 7.3, 4)
-    filled = {(t["what"], t["value"]) for t in context.template if t["what"] != "ground plane"}
+    colours = {t["what"]: (t["value"], t["option"]) for t in context.template if t["what"].startswith("colour")}
+    assert colours["colour of building"] == ([0.75, 0.68, 0.6], "building_colour")
+    assert set(colours) == {f"colour of {kind}" for kind in ("building", "wall", "floor", "door", "region", "ground")}
+    filled = {(t["what"], t["value"]) for t in context.template if not isinstance(t["value"], list)}
     assert {("height of building", 5.0), ("height of wall", 2.0), ("height of tree", 3.0)} <= filled
     assert ("sun", "directional light") in filled
     assert {d["what"] for d in context.dropped} == {"objects of kind poi", "objects of kind building"}
     assert write(parts, None, (Level(), Level("L2", 3.0)), wall_height=2.0, building_height=5.0) == files
+
+
+def test_what_no_source_tells_can_be_said() -> None:
+    rows = [
+        ("fence", shapely.LineString([(0, 0), (4, 0)]), {"kind": "fence"}),
+        ("tree", shapely.Point(9, 0), {"kind": "tree"}),
+        ("floor", shapely.box(0, 5, 2, 7), {"kind": "floor"}),
+        ("door", shapely.LineString([(0, 5), (1, 5)]), {"kind": "door"}),
+        ("rock", shapely.Point(5, 9), {"kind": "obstacle"}),
+        ("pole", shapely.Point(5, 12), {"kind": "pole"}),
+        ("house", shapely.box(20, 5, 22, 7), {"kind": "building", "height": 4.0}),
+    ]
+    parts = {PartKey("objects", name="osm"): features(rows, "local")}
+    measures = {
+        "barrier_height": 1.5, "tree_height": 5.0, "floor_thickness": 0.3, "door_height": 2.4, "obstacle_height": 0.4,
+        "pole_height": 7.0, "wall_thickness": 0.5, "pole_radius": 0.2,
+    }  # fmt: skip
+    files, context = report(
+        parts, **measures, building_colour=(0.0, 0.5, 1.0), sun=False, ground_colour=(0.1, 0.2, 0.1)
+    )
+    assert check(files) == []
+    by = {f.properties["name"]: f for f in objects(told(files))}
+    box = solids.Solids({}, False, True)
+
+    def extent(name: str) -> Any:
+        return pytest.approx(box.bounds(by[name].properties), abs=0.01)
+
+    assert extent("fence") == (0, -0.25, 0, 4, 0.25, 1.5)
+    assert extent("tree") == (8.8, -0.2, 0, 9.2, 0.2, 5)
+    assert extent("floor") == (0, 5, -0.3, 2, 7, 0)
+    assert box.bounds(by["rock"].properties)[5] == pytest.approx(0.4)
+    assert box.bounds(by["pole"].properties)[5] == pytest.approx(7.0)
+    house = next(m for m in tree(files).iter("model") if m.get("name") == "house")
+    assert house.findtext(".//diffuse") == "0 0.5 1 1"
+    ground = next(m for m in tree(files).iter("model") if m.get("name") == "ground_plane")
+    assert ground.findtext(".//diffuse") == "0.1 0.2 0.1 1"
+    assert tree(files).find(".//light") is None
+    said = {t["option"]: t["value"] for t in context.template if "option" in t}
+    assert {name: said[name] for name in measures} == measures
+    assert "sun" not in said
+    bare = tree(write(parts, ground=False, sun=False))
+    assert "ground_plane" not in {m.get("name") for m in bare.iter("model")}
 
 
 def test_shapes_may_be_felt_or_seen_only_and_have_colours() -> None:
