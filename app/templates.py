@@ -46,8 +46,9 @@ SETS: Final[Mapping[str, Set]] = {
         {
             "tmap2": {"verts_radius": 1.5, "xy_goal_tolerance": 0.5, "yaw_goal_tolerance": 0.3},
             "tmap": {"verts_radius": 1.5, "xy_goal_tolerance": 0.5, "yaw_goal_tolerance": 0.3, "top_vel": 1.0},
-            "gazebo": {"wall_height": 1.5},
+            "gazebo": {"wall_height": 1.5, "wall_thickness": 0.3, "ground_colour": [0.35, 0.5, 0.25]},
             "lanelet2": {"width": 3.0, "location": "nonurban"},
+            "datum": {"half_size": 250.0},
         },
     ),
     "indoor": Set(
@@ -64,9 +65,11 @@ SETS: Final[Mapping[str, Set]] = {
         {
             "tmap2": {"xy_goal_tolerance": 0.1, "yaw_goal_tolerance": 0.05},
             "tmap": {"xy_goal_tolerance": 0.1, "yaw_goal_tolerance": 0.05, "top_vel": 1.5},
-            "gazebo": {"wall_height": 6.0, "building_height": 8.0},
+            "gazebo": {"wall_height": 6.0, "building_height": 8.0, "ground_colour": [0.6, 0.6, 0.6]},
             "lanelet2": {"width": 2.0},
             "lif": {"vehicle_type": "forklift"},
+            "openrmf": {"speed_limit": 1.5},
+            "rmf_nav_graph": {"speed_limit": 1.5},
         },
     ),
     "ros2": Set(

@@ -82,7 +82,7 @@ def objects_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> L
             "no stored object has a body: upload walls, buildings, barriers, trees or a world with solids"
         )
     if guessed:
-        notes.fill("height", parameters.extrude, f"{guessed} footprints do not say how high they are")
+        notes.fill("height", parameters.extrude, f"{guessed} footprints do not say how high they are", "extrude")
     corners = np.concatenate(triangles)
     owner = np.repeat(np.arange(len(triangles)), [len(one) for one in triangles])
     made_of = _voxels(corners, owner, parameters, notes)

@@ -108,9 +108,11 @@ def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: Notes) -
     for kind in sorted(used):
         if parameters.height is None:
             value = CONTEXTS[parameters.context].heights[kind]
-            notes.fill(f"height of {kind}", value, f"a grid tells none; usual in the context {parameters.context}")
+            notes.fill(
+                f"height of {kind}", value, f"a grid tells none; usual in the context {parameters.context}", "context"
+            )
     if parameters.height is not None:
-        notes.fill("height", parameters.height, "a grid does not say how high what it shows is")
+        notes.fill("height", parameters.height, "a grid does not say how high what it shows is", "height")
     notes.warn(f"what the objects are is guessed from their shapes in the context {parameters.context}")
     return Layers(parts, layers.datum, layers.levels)
 

@@ -69,7 +69,7 @@ def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) ->
             "voxels are made of a grid's occupied and free cells, and the stored grids have none: upload an occupancy "
             "grid, an octree or a point cloud"
         )
-    notes.fill("height", parameters.height, "a grid does not say how high what it shows is")
+    notes.fill("height", parameters.height, "a grid does not say how high what it shows is", "height")
     return Layers(parts, layers.datum, layers.levels)
 
 

@@ -137,7 +137,7 @@ def _free(
     notes.drop("edges without a course", flat, "they have no geometry")
     if assumed:
         told = parameters.edge_width or f"{WIDTH} m, of a way that of its class"
-        notes.fill("width of edges", told, f"{assumed} edges do not say how wide they are; see edge_width")
+        notes.fill("width of edges", told, f"{assumed} edges do not say how wide they are", "edge_width")
     areas = np.empty(len(shapes), object)
     areas[:] = shapes
     chosen = np.array(through, bool)

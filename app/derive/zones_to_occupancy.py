@@ -87,7 +87,7 @@ def zones_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> 
             _burn(cells, frame, lanes, [FREE] * len(lanes), touched=False)
             _burn(cells, frame, blocked, [OCCUPIED] * len(blocked), touched=True)
             if lanes:
-                notes.fill("cost beside preferred lanes", parameters.lane_cost, "no zone says it; see lane_cost")
+                notes.fill("cost beside preferred lanes", parameters.lane_cost, "no zone says it", "lane_cost")
             parts[PartKey("occupancy", level, KEEPOUT)] = frame.grid(cells, KEEPOUT, Info(masks.KEEPOUT, 0.0, 1.0))
         slow = [z for z in zones if z.kind in SPEEDS]
         values, info = _limits(slow, parameters, notes) if slow else ([], None)

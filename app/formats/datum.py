@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from app.model.features import Features, features
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum
 from app.model.grid import OccupancyGrid
 from app.model.layers import SITE, Layers, PartKey
+from app.parameters import parameter
 
 NAME = "datum"
 FENCE = "fence"
@@ -35,17 +37,38 @@ MAPVIZ_ALTITUDE = 100.0
 HALF_MAP = 100.0
 """Metres from the datum: the template's map size, where nothing says how far the environment reaches."""
 
-NAVSAT: Mapping[str, Any] = {
-    "magnetic_declination_radians": 0.0,
-    "yaw_offset": 0.0,
-    "zero_altitude": True,
-    "broadcast_utm_transform": False,
-    "broadcast_utm_transform_as_parent_frame": False,
-    "publish_filtered_gps": True,
-    "use_odometry_yaw": False,
-    "wait_for_datum": True,
-}
-"""What the template says besides the datum."""
+
+@dataclass(frozen=True, slots=True)
+class NavSat:
+    """Parameters of robot_localization's navsat_transform_node besides the datum, as the template has them."""
+
+    magnetic_declination_radians: float = parameter(
+        0.0, "of navsat_transform_node, where no source has it", minimum=-4.0, maximum=4.0, unit="rad"
+    )
+    yaw_offset: float = parameter(
+        0.0, "of navsat_transform_node, where no source has it", minimum=-7.0, maximum=7.0, unit="rad"
+    )
+    zero_altitude: bool = parameter(True, "of navsat_transform_node, where no source has it")
+    broadcast_utm_transform: bool = parameter(False, "of navsat_transform_node, where no source has it")
+    broadcast_utm_transform_as_parent_frame: bool = parameter(False, "of navsat_transform_node, where no source has it")
+    publish_filtered_gps: bool = parameter(True, "of navsat_transform_node, where no source has it")
+    use_odometry_yaw: bool = parameter(False, "of navsat_transform_node, where no source has it")
+    wait_for_datum: bool = parameter(True, "of navsat_transform_node, where no source has it")
+
+
+NAVSAT = tuple(f.name for f in fields(NavSat))
+"""Their names, in the template's order."""
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions(NavSat):
+    """What the file says where no source does."""
+
+    half_size: float = parameter(
+        HALF_MAP, "from the datum to each side of the map, where nothing tells its extent", minimum=1.0, maximum=1e5,
+        unit="m",
+    )  # fmt: skip
+
 
 HEAD = "# Site datum: the place of the local (0, 0), degrees WGS 84\n"
 FENCE_HEAD = "\n# GNSS fence, [latitude, longitude]\n"
@@ -229,6 +252,10 @@ def _chosen(layers: Layers, context: WriteContext) -> tuple[Any, dict[str, Any],
     return fence, known, found[0][4]
 
 
+def _options(context: WriteContext) -> WriteOptions:
+    return context.options if isinstance(context.options, WriteOptions) else WriteOptions()
+
+
 def _size(document: Mapping[str, Any], layers: Layers, ring: Any, context: WriteContext) -> dict[str, Any]:
     """gmapping as the source has it, with what it lacks from the extent of fence and data, in whole metres."""
     said = document.get("gmapping")
@@ -238,14 +265,15 @@ def _size(document: Mapping[str, Any], layers: Layers, ring: Any, context: Write
         return size
     extent = _extent(layers, ring)
     if extent is None:
-        why, extent = "the template's size: nothing tells the extent", (-HALF_MAP, -HALF_MAP, HALF_MAP, HALF_MAP)
+        half = _options(context).half_size
+        why, extent, option = "nothing tells the extent", (-half, -half, half, half), "half_size"
     else:
-        why = "the extent of the fence and the data, whole metres"
+        why, option = "the extent of the fence and the data, whole metres", None
     west, south, east, north = extent
     made = {"xmin": math.floor(west), "xmax": math.ceil(east), "ymin": math.floor(south), "ymax": math.ceil(north)}
     for key in lacking:
         size[key] = made[key]
-    context.fill("gmapping", {key: size[key] for key in lacking}, why)
+    context.fill("gmapping", {key: size[key] for key in lacking}, why, option)
     return size
 
 
@@ -293,9 +321,10 @@ def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) ->
     """navsat_transform_node's parameters, its datum made from ours."""
     said = document.get("navsat_transform_node")
     navsat = dict(said) if isinstance(said, dict) else {}
-    lacking = {key: value for key, value in NAVSAT.items() if key not in navsat}
-    if lacking:
-        context.fill("navsat_transform_node", lacking, "no source has it")
+    usual = {key: getattr(_options(context), key) for key in NAVSAT}
+    for key in NAVSAT:
+        if key not in navsat:
+            context.fill(f"navsat_transform_node: {key}", usual[key], "no source has it", key)
     listed = navsat.pop("datum", None)
     yaw: Any = listed[2] if isinstance(listed, list) and len(listed) > 2 else None
     more = listed[3:] if isinstance(listed, list) else []
@@ -303,7 +332,7 @@ def _navsat(document: Mapping[str, Any], datum: Datum, context: WriteContext) ->
     if isinstance(yaw, bool) or not isinstance(yaw, (int, float)) or _heading(yaw) != datum.heading:
         yaw = -math.radians(datum.heading) + 0.0
     values = [_yaml.text(datum.latitude), _yaml.text(datum.longitude), *map(_yaml.text, [yaw, *more])]
-    return _ordered({**NAVSAT, **navsat}, 2, tuple(NAVSAT)) + f"  datum: [{', '.join(values)}]\n"
+    return _ordered({**usual, **navsat}, 2, NAVSAT) + f"  datum: [{', '.join(values)}]\n"
 
 
 def _ordered(values: Mapping[str, Any], column: int, first: Sequence[str]) -> str:
@@ -334,6 +363,7 @@ register(
         check=_datum_rules.check,
         write=write,
         needs=Needs(one_of=(frozenset({"location"}),), anchor="wgs84", datum=True),
+        write_options=WriteOptions,
         family=NAME,
         rank=60,
         extensions=(".yaml", ".yml"),

@@ -100,6 +100,7 @@ class WriteOptions:
     width: float = parameter(1.0, "width of lanes whose edge has none", minimum=0.01, maximum=100.0, unit="m")
     subtype: str = parameter("road", "subtype of lanes whose source names none: road, walkway, crosswalk …")
     location: str = parameter("urban", "location of new lanes: urban or nonurban")
+    bounds: str = parameter("virtual", "type of the bounds of new lanes: virtual, line_thin, curbstone …")
     projector_info: bool = parameter(
         False, "also write map_projector_info.yaml (Local: local_x and local_y are metres in the environment's frame)"
     )
@@ -933,11 +934,11 @@ class _Writer:
         if new:
             why = "the edges of the network say no more"
             if default := sum("width" not in lane.edge.properties for lane in new):
-                self.context.fill("width of lanes", self.options.width, f"{default} edges say none")
-            self.context.fill("type of bounds", "virtual", why)
-            self.context.fill("location of lanelets", self.options.location, why)
+                self.context.fill("width of lanes", self.options.width, f"{default} edges say none", "width")
+            self.context.fill("type of bounds", self.options.bounds, why, "bounds")
+            self.context.fill("location of lanelets", self.options.location, why, "location")
             if any(self.subtype(lane.edge) == self.options.subtype for lane in new):
-                self.context.fill("subtype of lanelets", self.options.subtype, why)
+                self.context.fill("subtype of lanelets", self.options.subtype, why, "subtype")
         more = sum(bool(e.properties.keys() - CANONICAL_EDGE) for e in net.edges)
         self.context.drop("further properties of edges", more, "lanelets have no place for them")
         more = sum(bool(n.properties.keys() - CANONICAL_NODE) for n in net.nodes)
@@ -1143,7 +1144,8 @@ class _Writer:
         members = []
         for role, refs in (("left", sides[0]), ("right", sides[1]), ("centerline", middle)):
             new = self.fresh()
-            self.ways[new] = (refs, {"type": "virtual"}, NOTHING)
+            kind = "virtual" if role == "centerline" else self.options.bounds
+            self.ways[new] = (refs, {"type": kind}, NOTHING)
             members.append(("way", new, role))
         known = own(edge.properties, NAME).get("tags")
         tags = {"type": "lanelet", "subtype": self.subtype(edge), "location": self.options.location}

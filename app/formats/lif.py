@@ -20,7 +20,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import orjson
@@ -105,6 +105,13 @@ class WriteOptions:
 
     vehicle_type: str = parameter("any", "type of vehicle of nodes and edges whose source names none")
     creator: str = parameter("Fleet Map Server", "creator of a file that no source names one for")
+    project: str | None = parameter(None, "project of a file that no source names one for; default: the map's name")
+    orientation_type: Literal["TANGENTIAL", "GLOBAL"] = parameter(
+        "TANGENTIAL", "what the orientation of vehicles on new edges is measured from"
+    )
+    vehicle_orientation: float = parameter(0.0, "of vehicles on new edges", minimum=-3.2, maximum=3.2, unit="rad")
+    rotation_allowed: bool = parameter(False, "whether vehicles may turn on new edges")
+    layout_version: str = parameter("1", "version of layouts that no source has")
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
@@ -503,12 +510,14 @@ class _Writer:
         top = {w: v for w, v in top.items() if w not in ("layouts", "origins")}
         meta = dict(own(top, "metaInformation"))
         if "lifId" not in meta and "projectIdentification" not in meta:
-            meta["projectIdentification"] = self.context.title
-            self.context.fill("metaInformation.projectIdentification", self.context.title, "no source names it")
+            meta["projectIdentification"] = self.options.project or self.context.title
+            said = meta["projectIdentification"]
+            self.context.fill("metaInformation.projectIdentification", said, "no source names it", "project")
         for word, value in (("creator", self.options.creator), ("exportTimestamp", EPOCH), ("lifVersion", VERSION)):
             if word not in meta:
                 meta[word] = value
-                self.context.fill(f"metaInformation.{word}", value, "no source names it")
+                option = word if word == "creator" else None
+                self.context.fill(f"metaInformation.{word}", value, "no source names it", option)
         return {**top, "metaInformation": meta}
 
     def _origins(self) -> list[tuple[dict[str, Any], list[str]]]:
@@ -546,7 +555,8 @@ class _Writer:
             said = next(of_level, None)
         if said is None:
             said = unique_ids([level], set(self.layouts))[0]
-            head = {"layoutId": said, "layoutVersion": "1", **({} if level == GROUND else {"layoutLevelId": level})}
+            version = self.options.layout_version
+            head = {"layoutId": said, "layoutVersion": version, **({} if level == GROUND else {"layoutLevelId": level})}
             self.layouts[said] = _Layout(head)
             self.filled["layouts"] += 1
         known = isinstance(at, int) and not isinstance(at, bool)
@@ -612,8 +622,11 @@ class _Writer:
         p = edge.properties
         out = self._base(p, "edge", name)
         out |= {"startNodeId": names[edge.source], "endNodeId": names[edge.target]}
-        usual = {"vehicleOrientation": 0.0, "orientationType": "TANGENTIAL", "rotationAllowed": False}
-        entries = self._vehicles(p, out, "edge", usual if self.dialect == FIRST else {"orientationType": "TANGENTIAL"})
+        usual: dict[str, Any] = {"orientationType": self.options.orientation_type}
+        if self.dialect == FIRST:
+            turn = {"vehicleOrientation": self.options.vehicle_orientation}
+            usual = {**turn, **usual, "rotationAllowed": self.options.rotation_allowed}
+        entries = self._vehicles(p, out, "edge", usual)
         speed = p.get("speed_limit")
         at = (np.round(shapely.get_coordinates(edge.geometry), METRES) + 0.0).tolist()
         for entry in entries:
@@ -662,15 +675,20 @@ class _Writer:
         why = "no source names a type of vehicle"
         for kind in ("nodes", "edges"):
             if self.filled[kind]:
-                context.fill(
-                    f"{kind}: type of vehicle", self.options.vehicle_type, f"{self.filled[kind]} {kind}: {why}"
-                )
+                reason = f"{self.filled[kind]} {kind}: {why}"
+                context.fill(f"{kind}: type of vehicle", self.options.vehicle_type, reason, "vehicle_type")
         if self.filled["edges"]:
-            context.fill("edges: orientation", "TANGENTIAL, no rotation", f"{self.filled['edges']} edges do not say it")
+            words = {"orientationType": "orientation_type"}
+            if self.dialect == FIRST:
+                words |= {"vehicleOrientation": "vehicle_orientation", "rotationAllowed": "rotation_allowed"}
+            for word, option in words.items():
+                reason = f"{self.filled['edges']} edges do not say it"
+                context.fill(f"edges: {word}", getattr(self.options, option), reason, option)
         if self.filled["layouts"]:
             context.fill(
                 "layouts", f"{self.filled['layouts']}, one for each level", "no source has a layout of the level"
             )
+            context.fill("layouts: layoutVersion", self.options.layout_version, "no source has it", "layout_version")
         if self.filled["stations"]:
             context.fill("stations: interactionNodeIds", [], f"{self.filled['stations']} stations name no nodes")
         for what, n in sorted(self.lost.items()):

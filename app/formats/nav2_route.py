@@ -21,6 +21,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,7 @@ from app.formats._network import (
 from app.formats._text import METRES
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.layers import NETWORK, Layers, PartKey
+from app.parameters import parameter
 
 NAME = "nav2_route"
 FRAME = "map"
@@ -67,6 +69,16 @@ LIFTED: Mapping[str, str] = {**TEXTS, **NUMBERS}
 """Metadata word -> the canonical word, for values that are texts and numbers."""
 
 TRIGGERS = ("NODE", "ON_ENTER", "ON_EXIT")
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What the file says where no source does."""
+
+    graph_name: str | None = parameter(None, "name of a graph that no source names; default: the map's")
+    frame_id: str = parameter(FRAME, "frame of nodes whose source names none")
+
+
 CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}
 """What Nav2's own graphs say, so that QGIS shows their metres; the route server does not look at it."""
 
@@ -358,6 +370,8 @@ class _Writer:
             what = "no node" if not self.net.nodes else "no edge between its nodes"
             raise CannotConvert(f"the network has {what}; the route server needs both: supply a network with edges")
         self.nodes, self.edges = self._numbers()
+        self.options = context.options if isinstance(context.options, WriteOptions) else WriteOptions()
+        self.framed = 0
         self.lost: Counter[str] = Counter()
 
     def _numbers(self) -> tuple[list[int], list[int]]:
@@ -398,8 +412,9 @@ class _Writer:
         members = self.document.get("members")
         head = {w: v for w, v in members.items() if w not in ("type", "features")} if isinstance(members, dict) else {}
         if not self.document:
-            head = {"name": self.context.title, "crs": CRS}
-            self.context.fill("name", self.context.title, "no source names the graph")
+            title = self.options.graph_name or self.context.title
+            head = {"name": title, "crs": CRS}
+            self.context.fill("name", title, "no source names the graph", "graph_name")
             self.context.fill("crs", CRS["properties"], "QGIS shows metres by it; the route server ignores it")
         if self.context.attribution and not head.keys() & {"attribution", "license", "copyright"}:
             head["attribution"] = "; ".join(self.context.attribution)
@@ -412,7 +427,8 @@ class _Writer:
         said = mine.get("properties")
         properties: dict[str, Any] = {"id": n, **ends}
         if NAME not in p and not ends:
-            properties["frame"] = FRAME
+            properties["frame"] = self.options.frame_id
+            self.framed += 1
         if isinstance(said, dict):
             properties |= {w: v for w, v in said.items() if w not in properties}
         metadata = properties.get("metadata")
@@ -462,6 +478,8 @@ class _Writer:
         if len(set(net.levels)) > 1:
             context.drop("levels of nodes", len(net.nodes), "all networks are joined into one graph")
         foreign = sum(NAME not in n.properties for n in net.nodes) + sum(NAME not in e.properties for e in net.edges)
+        if self.framed:
+            context.fill("frame", self.options.frame_id, f"{self.framed} nodes name none", "frame_id")
         if foreign:
             context.fill("id", "a number made from each id", f"{foreign} nodes and edges have no number of their own")
         context.drop(
@@ -539,6 +557,7 @@ register(
         read=read,
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        write_options=WriteOptions,
         family=NAME,
         check=_nav2_route_rules.check,
         lacks=lacks,

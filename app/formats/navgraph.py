@@ -56,6 +56,7 @@ from app.formats._network import (
 from app.formats._text import METRES, numbers
 from app.model.features import Properties, from_columns, unique_ids
 from app.model.layers import NETWORK, Layers, PartKey
+from app.parameters import parameter
 
 NAME = "navgraph"
 PREFIX = "tag:fawkesrobotics.org,navgraph/"
@@ -301,6 +302,13 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
 
 @dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What the file says where no source does."""
+
+    graph_name: str | None = parameter(None, "name of a graph that no source names; default: the map's")
+
+
+@dataclass(frozen=True, slots=True)
 class _Connection:
     """A line of the file: its tag, its ends (places of nodes), whether another format's network has it."""
 
@@ -348,8 +356,9 @@ class _Writer:
         said = self.document.get("top")
         top = {w: v for w, v in said.items() if w not in TOP_KEYS} if isinstance(said, dict) else {}
         if not isinstance(top.get("graph-name"), str) or not top["graph-name"]:
-            top["graph-name"] = self.context.title
-            self.context.fill("graph-name", self.context.title, "no source names it")
+            said = getattr(self.context.options, "graph_name", None)
+            top["graph-name"] = said or self.context.title
+            self.context.fill("graph-name", top["graph-name"], "no source names it", "graph_name")
         first = {key: top.pop(key) for key in ("graph-name", "root") if key in top}
         out = [_yaml.mapping({key: value}, 0) for key, value in first.items()]
         if top:
@@ -581,6 +590,7 @@ register(
         check=_navgraph_rules.check,
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
+        write_options=WriteOptions,
         family=NAME,
         rank=35,
         extensions=(".yaml", ".yml"),

@@ -270,6 +270,15 @@ def _edges(said: Any, place: Mapping[str, int], context: ReadContext) -> tuple[l
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What the file says where no source does."""
+
+    pixel_size: float = parameter(
+        RESOLUTION, "of the picture that is thought of, where no map's is known", minimum=1e-3, maximum=100.0, unit="m"
+    )
+
+
 def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """``prm.yaml``: all networks as one roadmap, nodes by length and text of their ids, edges by their nodes.
 
@@ -390,9 +399,11 @@ def _picture_of(layers: Layers, document: Mapping[str, Any], xy: Array, context:
             return _picture_said(known)
     low = np.floor(xy.min(axis=0) - MARGIN) if len(xy) else np.zeros(2)
     high = np.ceil(xy.max(axis=0) + MARGIN) if len(xy) else np.ones(2)
-    rows = max(1, math.ceil((high[1] - low[1]) / RESOLUTION))
-    made = _Picture(RESOLUTION, (float(low[0]), float(low[1]), 0.0), rows)
-    context.fill("picture: resolution, origin, height", made.as_dict(), "no map's picture is known")
+    size = context.options.pixel_size if isinstance(context.options, WriteOptions) else RESOLUTION
+    rows = max(1, math.ceil((high[1] - low[1]) / size))
+    made = _Picture(size, (float(low[0]), float(low[1]), 0.0), rows)
+    told = "picture: resolution, origin, height"
+    context.fill(told, made.as_dict(), "no map's picture is known", "pixel_size")
     return made
 
 
@@ -432,6 +443,7 @@ register(
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"occupancy"})),
         looks_at=looks_at,
         read_options=ReadOptions,
+        write_options=WriteOptions,
         family=NAME,
         rank=3,
         extensions=(".yaml", ".yml"),

@@ -67,7 +67,9 @@ def test_footprints_are_extruded_from_their_base_to_their_top() -> None:
     v = voxels(layers(objects(*rows)), notes, extrude=3.0)
     assert v.voxel_counts()["occupied"] == 10 * 10 * 10 + 22 * 30  # the wall is half its thickness longer on each end
     assert v.bounds() == (0.0, 0.0, 0.0, 7.1, 1.0, 3.0)
-    assert notes.template == [{"what": "height", "value": 3.0, "why": "1 footprints do not say how high they are"}]
+    (line,) = notes.template
+    assert (line["what"], line["value"], line["option"]) == ("height", 3.0, "extrude")
+    assert line["why"] == "1 footprints do not say how high they are"
 
 
 def test_all_levels_stand_in_one_map() -> None:

@@ -112,7 +112,9 @@ def test_the_sample_in_full() -> None:
     template = after["navsat_transform_node"]
     assert template | before["navsat_transform_node"] == template
     assert {**after, "navsat_transform_node": 0} == {**before, "navsat_transform_node": 0}
-    assert [t["what"] for t in told.template] == ["navsat_transform_node"]
+    lacking = {key for key in template if key not in before["navsat_transform_node"]}
+    assert {t["option"] for t in told.template} == lacking
+    assert {t["what"].partition(": ")[0] for t in told.template} == {"navsat_transform_node"}
     assert "frequency" in template
 
 
@@ -152,7 +154,25 @@ def test_what_no_source_says_is_filled_in_from_the_extent() -> None:
     assert top["mapviz_initialize_origin"]["local_xy_origins"][0]["latitude"] == 10.0
     assert top["navsat_transform_node"]["wait_for_datum"] is True
     assert top["navsat_transform_node"]["datum"] == [10.0, 20.0, 0.0]
-    assert {t["what"] for t in told.template} == {"gmapping", "mapviz_initialize_origin", "navsat_transform_node"}
+    whats = {t["what"].partition(": ")[0] for t in told.template}
+    assert whats == {"gmapping", "mapviz_initialize_origin", "navsat_transform_node"}
+
+
+def test_what_no_source_says_can_be_said() -> None:
+    told = WriteContext(
+        options=formats.write_options(FORMAT, {"wait_for_datum": "no", "yaw_offset": "1.57", "half_size": 50})
+    )
+    top = yaml.safe_load(formats.write(FORMAT, Layers({}, Datum(10.0, 20.0)), told)["datum.yaml"])
+    assert top["gmapping"] == {"xmin": -50, "xmax": 50, "ymin": -50, "ymax": 50}
+    assert top["navsat_transform_node"]["wait_for_datum"] is False
+    assert top["navsat_transform_node"]["yaw_offset"] == 1.57
+    assert {t.get("option") for t in told.template} >= {"wait_for_datum", "yaw_offset", "half_size"}
+    data = (SAMPLES / "datum.yaml").read_bytes()
+    other = {"use_odometry_yaw": True, "wait_for_datum": False}
+    said = WriteContext(options=formats.write_options(FORMAT, other))
+    served = yaml.safe_load(formats.write(FORMAT, read(data)[0], said)["datum.yaml"])["navsat_transform_node"]
+    source = yaml.safe_load(data)["navsat_transform_node"]
+    assert {key: served[key] for key in other} == {**other, **{k: v for k, v in source.items() if k in other}}
 
 
 def test_a_datum_without_a_fence_is_served_and_read() -> None:

@@ -590,13 +590,16 @@ def test_osmium_reads_what_is_written(shared: Path, facts_json: dict[str, Any], 
 
 def test_options_are_heeded() -> None:
     one = net([("a", "b")], {"a": (0.0, 0.0, 1.0), "b": (10.0, 0.0, 2.0)})
-    options = WriteOptions(width=3.0, subtype="walkway", location="nonurban", projector_info=True)
+    options = WriteOptions(width=3.0, subtype="walkway", location="nonurban", bounds="curbstone", projector_info=True)
     files, told = write(Layers({NETWORK: one}, HERE), options=options)
     tags, sides, at = lanelets(files[MAIN])["a_b"]
     assert (tags["subtype"], tags["location"], "width" in tags) == ("walkway", "nonurban", False)
     assert {at[r][1] for r in sides["left"]} == {1.5}
     assert files[PROJECTOR].startswith(b"projector_type: Local")
-    assert {"what": "width of lanes", "value": 3.0, "why": "1 edges say none"} in told.template
+    assert {"what": "width of lanes", "value": 3.0, "why": "1 edges say none", "option": "width"} in told.template
+    assert [e["tags"]["type"] for (kind, _), e in elements(files[MAIN]).items() if kind == "way"].count(
+        "curbstone"
+    ) == 2
     assert [elements(files[MAIN])["node", r]["tags"]["ele"] for r in sides["right"]] == ["1.0", "2.0"]
     layers, _ = read(files)
     assert part(layers).local.all()

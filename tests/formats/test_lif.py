@@ -211,7 +211,30 @@ def test_what_an_edit_changes_is_served() -> None:
     assert [e["maxSpeed"] for e in hall["edges"][0]["vehicleTypeEdgeProperties"]] == [0.75, 0.75]
     assert hall["nodes"][-1]["nodeId"] == "new"
     assert hall["nodes"][-1]["vehicleTypeNodeProperties"] == [{"vehicleTypeId": "any"}]
-    assert [t["what"] for t in told.template] == ["nodes: type of vehicle"]
+    assert [(t["what"], t["option"]) for t in told.template] == [("nodes: type of vehicle", "vehicle_type")]
+
+
+def test_what_no_source_says_can_be_said() -> None:
+    edge = {"kind": "edge", "source": "a", "target": "b"}
+    rows: list[tuple[str, Any, dict[str, Any]]] = [
+        ("a", shapely.Point(0, 0), {"kind": "node"}),
+        ("b", shapely.Point(3, 0), {"kind": "node"}),
+        ("e", shapely.LineString([(0, 0), (3, 0)]), edge),
+    ]
+    wish = {
+        "vehicle_type": "fork", "creator": "me", "project": "hall", "orientation_type": "GLOBAL",
+        "vehicle_orientation": 1.5, "rotation_allowed": True, "layout_version": "7",
+    }  # fmt: skip
+    told = WriteContext(options=formats.write_options(FORMAT, wish))
+    layers = Layers({PartKey("topology", "ground", "network"): features(rows, "local")})
+    top = json.loads(formats.write(FORMAT, layers, told)["layout.lif.json"])
+    assert (top["metaInformation"]["creator"], top["metaInformation"]["projectIdentification"]) == ("me", "hall")
+    (layout,) = top["layouts"]
+    assert layout["layoutVersion"] == "7"
+    assert layout["edges"][0]["vehicleTypeEdgeProperties"] == [
+        {"vehicleTypeId": "fork", "vehicleOrientation": 1.5, "orientationType": "GLOBAL", "rotationAllowed": True}
+    ]
+    assert {t["option"]: t["value"] for t in told.template if "option" in t} == wish
 
 
 def test_drafts_speak_their_own_words(shared: Path) -> None:

@@ -297,7 +297,13 @@ def test_a_network_of_another_format() -> None:
     assert all(
         m == {"action": "row_traversal", "abs_speed_limit": 2.0} for (k, _), m in server.metadata.items() if k == "edge"
     )
-    assert {t["what"] for t in told.template} == {"id", "name", "crs"}
+    assert {t["what"] for t in told.template} == {"id", "name", "crs", "frame"}
+    options = formats.write_options(FORMAT, {"graph_name": "rows", "frame_id": "farm_map"})
+    context = WriteContext(options=options)
+    said = json.loads(formats.write(FORMAT, Layers({NETWORK: part}), context)["graph.geojson"])
+    assert said["name"] == "rows"
+    assert {f["properties"].get("frame") for f in said["features"] if f["geometry"]["type"] == "Point"} == {"farm_map"}
+    assert {t["option"] for t in context.template if "option" in t} == {"graph_name", "frame_id"}
     assert [(d["what"], d["count"]) for d in told.dropped] == [("items with attributes that Nav2 has no word for", 4)]
     back, _ = read(served)
     assert {p["name"] for p in back.properties if p["kind"] == "node"} == {"A", "B", "C"}

@@ -276,6 +276,7 @@ def test_a_network_of_another_format_is_one_that_fawkes_takes() -> None:
         "attributes of nodes that are no scalars": 1,
     }
     assert {t["what"] for t in told.template} == {"graph-name", "nodes: !unconnected"}
+    assert next(t["option"] for t in told.template if t["what"] == "graph-name") == "graph_name"
     assert told.warnings == []
     assert write(read(served)[0])[0] == served
 

@@ -161,6 +161,10 @@ def test_a_network_from_elsewhere_gets_pixels_of_the_stored_map() -> None:
     alone, context = write(Layers({NETWORK: network}))
     assert alone["picture"] == {"resolution": 0.05, "origin": [0.0, 1.0, 0.0], "height": 80}
     assert "picture: resolution, origin, height" in [t["what"] for t in context.template]
+    coarse = WriteContext(options=formats.write_options(FORMAT, {"pixel_size": 0.5}))
+    made = yaml.safe_load(formats.write(FORMAT, Layers({NETWORK: network}), coarse)["prm.yaml"])
+    assert made["picture"] == {"resolution": 0.5, "origin": [0.0, 1.0, 0.0], "height": 8}
+    assert [t["option"] for t in coarse.template if "option" in t] == ["pixel_size"]
     again, _ = read({"prm.yaml": yaml.safe_dump(alone).encode()})
     assert np.allclose(nodes(again)["0"], [3.0, 4.0], atol=0.05)
 
