@@ -27,6 +27,7 @@ from app.model.features import Features, features, from_columns
 from app.model.frame import Datum, Level
 from app.model.grid import OccupancyGrid
 from app.model.layers import Layers, Part, PartKey
+from app.model.templates import NO_TEMPLATES
 
 FORMAT = get_format("environment")
 SAMPLE = (Path(__file__).resolve().parents[1] / "samples/environment/yard.zip").read_bytes()
@@ -353,7 +354,7 @@ def test_odd_variables_are_left_out_and_told(tmp_path: Path) -> None:
 
 
 def test_a_new_writer_of_an_inner_map_makes_a_new_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    version: Any = SimpleNamespace(datum=None, levels=())
+    version: Any = SimpleNamespace(datum=None, levels=(), templates=NO_TEMPLATES)
     way = recipe.Chain((), ())
 
     def keys() -> list[str]:
