@@ -224,7 +224,9 @@ class GenerationBody(In):
     model_config = ConfigDict(
         extra="forbid",
         allow_inf_nan=False,
-        json_schema_extra={"examples": [{"generator": "orchard", "seed": 7, "parameters": {"rows": 6}}]},
+        json_schema_extra={
+            "examples": [{"generator": "orchard", "seed": 7, "parameters": {"rows": 6}, "replace": True}]
+        },
     )
 
     generator: str = Field(max_length=200, description="A generator's name; see `/api/v1/generators`.")
