@@ -162,6 +162,11 @@ class Agent:
             config=self.options.zenoh_config,
             login=self._login,
         )
+        if self._login.user not in (None, self._robot):
+            reason = (
+                f"a fleet map server's router lets the user {self._login.user} be seen as the robot of that name alone"
+            )
+            self._tell("user", detail=f"{reason}: use --robot {self._login.user}, or its own user")
         if (installed := self._folder.manifest(self._folder.standing)) is not None:
             self._tell("holding", version=installed.version, root=installed.root)
         failures = 0

@@ -41,6 +41,9 @@ FRAME = "map"
 HEARTBEAT_SECONDS = 0.5
 LOOK_SECONDS = 0.02
 POLL_SECONDS = 1.0
+ASK_SECONDS = 5.0
+"""How often the database is asked all the same: another host may have committed."""
+
 RETRY_SECONDS = 30.0
 """After a map could not be made it is tried again so much later, or when the channel moves."""
 
@@ -207,7 +210,7 @@ class Ros2:
         self._note({"state": "connected", "topics": len(self._owners)})
         asked = time.monotonic()
         while not self._ending.wait(LOOK_SECONDS):
-            if self._generation() != generation or time.monotonic() - asked > POLL_SECONDS:
+            if self._generation() != generation or time.monotonic() - asked > ASK_SECONDS:
                 return
 
     def _open(self) -> bool:

@@ -80,7 +80,7 @@ def test_an_agent_with_a_wrong_password_still_polls(secure: Api, authority: Auth
     env = place(secure, "field")
     certificate, key = authority.sign("stranger")
     one = Robot(
-        secure.url, env, tmp_path / "tractor", "--poll", "0.5", "--ca", str(authority.pem), "--zenoh-ca",
+        secure.url, env, tmp_path / "plough", "--poll", "0.5", "--ca", str(authority.pem), "--zenoh-ca",
         str(authority.pem), "--zenoh-certificate", str(certificate), "--zenoh-key", str(key), "--zenoh-user", "tractor",
         FLEETMAP_ZENOH_PASSWORD="guessed",
     )  # fmt: skip
@@ -89,6 +89,8 @@ def test_an_agent_with_a_wrong_password_still_polls(secure: Api, authority: Auth
         secure.upload(env, {"n.tmap2.yaml": network(0.5, count=20)})
         one.wait("active", 20, version=2)
         assert one.saw("connected") is None
+        assert "use --robot tractor" in one.wait("user")["detail"]
+        assert eventually(lambda: (r := robot_of(secure, "plough")) and r["version"] == 2), "over HTTPS"
         assert one.stop() == 0
     finally:
         one.kill()

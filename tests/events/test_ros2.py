@@ -466,7 +466,7 @@ def test_what_cannot_be_had_leaves_the_last_map_and_is_tried_again(
     router: tuple[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("app.events.ros2.RETRY_SECONDS", 0.2)
-    monkeypatch.setattr("app.events.ros2.POLL_SECONDS", 0.1)
+    monkeypatch.setattr("app.events.ros2.ASK_SECONDS", 0.1)
     where, port = router
     state = {"root": "a", "fails": 0, "calls": 0}
 
