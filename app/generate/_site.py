@@ -157,6 +157,11 @@ def orientation(yaw: float) -> list[float]:
     return [0.0, 0.0, round(math.sin(yaw / 2), 6) + 0.0, round(math.cos(yaw / 2), 6) + 0.0]
 
 
+def rgb(colour: str) -> list[float]:
+    """A colour of COLOURS as shapes have it."""
+    return [round(v / 255, 3) for v in COLOURS[colour]]
+
+
 def refused(where: str, problem: str) -> CannotGenerate:
     """The error for one parameter."""
     return CannotGenerate(f"{where}: {problem}", [Problem(problem, where=where)])
@@ -166,11 +171,17 @@ class Site:
     """A site on its way to layers.
 
     datum: where it lies. fence: the polygon within which it lies (metres), the environment's or the generator's own;
-    is_given tells which, once ``bounded`` was called.
+    is_given tells which, once ``bounded`` was called. coloured: solids that say no colour have their object's.
     """
 
     def __init__(
-        self, given: Layers, options: SiteOptions, notes: Notes, *, levels: Sequence[Level] = (Level(),)
+        self,
+        given: Layers,
+        options: SiteOptions,
+        notes: Notes,
+        *,
+        levels: Sequence[Level] = (Level(),),
+        coloured: bool = False,
     ) -> None:
         self.given, self.options, self.notes, self.levels = given, options, notes, tuple(levels)
         self.datum = _datum(given, options, notes)
@@ -184,6 +195,7 @@ class Site:
         self._ground: dict[str, list[tuple[int, list[Any]]]] = {}
         self._bodies: dict[str, list[tuple[int, list[Any]]]] = {}
         self._base: dict[str, str] = {}
+        self.coloured = coloured
         self._count = 0
         self._room = math.inf
 
@@ -259,7 +271,8 @@ class Site:
             x, y, z, yaw = pose
             said["pose"] = [mm(x), mm(y), mm(z), 0.0, 0.0, angle(yaw)]
         if shapes:
-            said["shapes"] = [_plain(shape) for shape in shapes]
+            tint = {"colour": rgb(colour)} if self.coloured and colour is not None else {}
+            said["shapes"] = [{**_plain(shape), **({} if "colour" in shape else tint)} for shape in shapes]
         self._objects.setdefault((level, family), []).append((i, rounded(geometry), said))
         if colour is not None:
             shape = geometry if seen is None else seen

@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 
 from app.generate._field import Field, between
-from app.generate._site import Site, disc, mm
+from app.generate._site import Site, disc, mm, rgb
 
 CROWN = "models/crown/meshes/crown.stl"
 CROWNS = ("crown", "crown_light", "crown", "crown_dark")
@@ -61,8 +61,9 @@ def tree(
     site.files[CROWN] = crown_mesh()
     middle, half = mm((below + height) / 2), mm((height - below) / 2)
     stem = mm(below + half / 2)
+    upright = [0.0, 0.0, mm(stem / 2), 0.0, 0.0, 0.0]
     shapes: list[dict[str, Any]] = [
-        {"type": "cylinder", "radius": mm(trunk), "length": stem, "pose": [0.0, 0.0, mm(stem / 2), 0.0, 0.0, 0.0]},
+        {"type": "cylinder", "radius": mm(trunk), "length": stem, "pose": upright, "colour": rgb("wood")},
         {
             "type": "mesh",
             "file": CROWN,

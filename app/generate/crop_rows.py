@@ -40,7 +40,7 @@ class CropRows(FieldOptions):
 @generates({"location", "objects", "occupancy", "topology", "zones", "imagery"}, parameters=CropRows, also={"location"})
 def crop_rows(given: Layers, options: CropRows, source: Source, notes: Notes) -> Layers:
     """A field of crops: beds of several rows of plants, wheel tracks between them, headlands, and a yard."""
-    site = Site(given, options, notes)
+    site = Site(given, options, notes, coloured=True)
     width = (options.rows_per_bed - 1) * options.row_spacing
     out = _field.open_field(
         site,

@@ -36,7 +36,7 @@ def orchard(given: Layers, options: Orchard, source: Source, notes: Notes) -> La
     """An orchard: rows of trees with crowns, headlands, a yard with charging docks, and a network of its aisles."""
     if options.crown_diameter < options.trunk_diameter:
         raise refused("crown_diameter", "a crown is no thinner than its trunk")
-    site = Site(given, options, notes)
+    site = Site(given, options, notes, coloured=True)
     lines = _field.numbered(options.rows or _field.MOST_ROWS)
     out = _field.open_field(
         site,

@@ -12,7 +12,7 @@ import numpy as np
 from app.derive import Notes
 from app.generate import Source, _field, _trees, generates
 from app.generate._field import Field, FieldOptions, Line, Row
-from app.generate._site import Site, angle, mm, refused
+from app.generate._site import Site, angle, mm, refused, rgb
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -48,7 +48,7 @@ def polytunnels(given: Layers, options: Polytunnels, source: Source, notes: Note
     """Polytunnels: hoops and covers over rows of tables with strawberries, aisles between them, and a yard."""
     if options.tunnel_height <= options.side_height:
         raise refused("tunnel_height", "must be above side_height")
-    site = Site(given, options, notes)
+    site = Site(given, options, notes, coloured=True)
     count = options.rows_per_tunnel
     wanted = options.tunnels or 2
     out = _field.open_field(
@@ -166,9 +166,10 @@ def _table(site: Site, out: Field, row: Row, options: Polytunnels, stream: np.ra
     width, low, thick = options.table_width, options.table_height, 0.15
     middle = [mm(row.length / 2), 0.0, mm(low + thick / 2), 0.0, 0.0, 0.0]
     shapes: list[dict[str, Any]] = [{"type": "box", "size": [mm(row.length), mm(width), thick], "pose": middle}]
+    shapes[0]["colour"] = rgb("plastic")
     for u in _field.between(row, options.leg_spacing):
         place = [mm(u - row.low), 0.0, mm(low / 2), 0.0, 0.0, 0.0]
-        shapes.append({"type": "cylinder", "radius": 0.025, "length": mm(low), "pose": place})
+        shapes.append({"type": "cylinder", "radius": 0.025, "length": mm(low), "pose": place, "colour": rgb("metal")})
     leaves = 0.2 + 0.1 * float(stream.random())
     place = [mm(row.length / 2), 0.0, mm(low + thick + leaves / 2), 0.0, 0.0, 0.0]
     shapes.append({"type": "box", "size": [mm(row.length), mm(width * 0.9), mm(leaves)], "pose": place})

@@ -8,7 +8,7 @@ from typing import Any
 from app.derive import Notes
 from app.generate import Source, _field, _trees, generates
 from app.generate._field import Field, FieldOptions, Row
-from app.generate._site import Site, mm, rectangle, refused
+from app.generate._site import Site, mm, rectangle, refused, rgb
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -36,7 +36,7 @@ def vineyard(given: Layers, options: Vineyard, source: Source, notes: Notes) -> 
     """A vineyard: vines on trellises with posts and wires that no robot may pass, headlands, and a yard."""
     if options.canopy_top <= options.canopy_base:
         raise refused("canopy_top", "must be above canopy_base")
-    site = Site(given, options, notes)
+    site = Site(given, options, notes, coloured=True)
     out = _field.open_field(
         site,
         options,
@@ -69,11 +69,11 @@ def _trellis(site: Site, out: Field, row: Row, options: Vineyard) -> None:
     for u in _field.between(row, step):
         height = options.canopy_top
         place = [mm(u - row.low), 0.0, mm(height / 2), 0.0, 0.0, 0.0]
-        shapes.append({"type": "cylinder", "radius": 0.05, "length": mm(height), "pose": place})
+        shapes.append({"type": "cylinder", "radius": 0.05, "length": mm(height), "pose": place, "colour": rgb("wood")})
     wires = (options.canopy_base, (options.canopy_base + options.canopy_top) / 2)
     for z in wires:
         place = [mm(row.length / 2), 0.0, mm(z), 0.0, 0.0, 0.0]
-        shapes.append({"type": "box", "size": [mm(row.length), 0.01, 0.01], "pose": place})
+        shapes.append({"type": "box", "size": [mm(row.length), 0.01, 0.01], "pose": place, "colour": rgb("metal")})
     x, y = out.at(row.low, row.v)
     said: dict[str, Any] = {"name": f"Row {row.number}", "height": mm(options.canopy_top), "width": 0.1}
     site.put(f"trellis{row.number}", "fence", out.line(row), shapes=shapes, pose=(x, y, 0.0, out.yaw), **said)
@@ -91,9 +91,10 @@ def _vine(
     )
     wide = options.canopy_width * (0.7 + 0.3 * chance[1])
     along = min(options.vine_spacing, 2 * min(place[0] - row.low, row.high - place[0]) + options.vine_spacing / 2)
+    stem = [0.0, 0.0, mm(low / 2), 0.0, 0.0, 0.0]
     across = row.v - place[1]  # the leaves hang on the wires, wherever the trunk stands
     shapes: list[dict[str, Any]] = [
-        {"type": "cylinder", "radius": 0.04, "length": mm(low), "pose": [0.0, 0.0, mm(low / 2), 0.0, 0.0, 0.0]},
+        {"type": "cylinder", "radius": 0.04, "length": mm(low), "pose": stem, "colour": rgb("wood")},
         {
             "type": "box",
             "size": [mm(along), mm(wide), mm(high - low)],

@@ -63,7 +63,7 @@ class Warehouse(FieldOptions):
 )
 def warehouse(given: Layers, options: Warehouse, source: Source, notes: Notes) -> Layers:
     """A warehouse: a hall with racks and pallets, aisles (one-way on request), loading docks, chargers and parking."""
-    site = Site(given, options, notes)
+    site = Site(given, options, notes, coloured=True)
     lines = [Line("row", k, f"A{k}") for k in range(1, (options.racks or _field.MOST_ROWS) + 1)]
     out = _field.open_field(
         site,

@@ -231,7 +231,7 @@ def test_the_demo_comes_once_and_its_commands_work(fleetmap: Fleetmap, server: s
     version = fleetmap("versions", demo.NAME, "--json").json[0]
     assert version["warnings"] == []
     held = {layer for layer, kind in version["information"].items() if kind != "missing"}
-    assert held == {"location", "objects", "topology", "occupancy", "zones"}
+    assert held == {"location", "objects", "topology", "occupancy", "zones", "imagery"}
     assert len(demo.curl_lines(server, TOKEN)) == 3
     for line in demo.curl_lines(server, TOKEN):
         done = subprocess.run(

@@ -35,11 +35,11 @@ SMALL: dict[str, dict[str, Any]] = {
     "warehouse": {"racks": 2, "row_length": 22, "docks": 2, "parking": 1},
 }
 DIGESTS = {
-    "orchard": "ed5074a86d65f66cc57c8adbc605409422637eaf99ca2cca2043b31660e497c7",
-    "crop_rows": "72771bb1c902b5ffb22255b2493695cd59bc0af0a93656aa69ba91222cb1cfde",
-    "polytunnels": "86de56fc285bed214277ccc483be3c7f0252372ed5ff4d8bb1d631f25f6f1c66",
-    "vineyard": "c2231f822dcde414287b056eb0af14ece3de13fd0ce8a590d3407b4717a3aa07",
-    "warehouse": "49d633bae2fc8a30c667530409624cc17858353178d423993b6090261b9db616",
+    "orchard": "7649191cd4897a55b3f0fc4813b9515451d9018d3afb65050a906f31ece29f4e",
+    "crop_rows": "fe25e32f54d9cd9b4cf4491e74b640e1a0d1abe59ba9e91f4b9d5dd75c888a1e",
+    "polytunnels": "939fd4b7d5ceb306387a15471b4e6ed6c4461643da228bd24b535bce23971c40",
+    "vineyard": "e1545af753dd6513aa5275f088a6019ec5ac1e0393f94b119eb94f8584cffba8",
+    "warehouse": "46d013456bd2b5bb8eb50cde47975705adda8eb55f5c2fa5028942e33d4b54f9",
 }
 HERE = Datum(53.2686, -0.5245, heading=12.0)
 FENCES = {
@@ -136,6 +136,9 @@ def test_trees_stand_where_they_were_asked_for() -> None:
     part = made.parts[OBJECTS]
     assert isinstance(part, Features)
     trees = [f for f in part if f.properties["kind"] == "tree"]
+    trunk, crown = trees[0].properties["shapes"]
+    assert trunk["colour"] == [0.541, 0.408, 0.259], "138, 104, 66"
+    assert crown["colour"][1] > crown["colour"][0], "green"
     assert len(trees) == 3 * 7
     lines = {f.properties["name"]: f.geometry for f in part if f.properties["kind"] == "tree_row"}
     assert lines["Row 1"].distance(lines["Row 2"]) == pytest.approx(5.0)
