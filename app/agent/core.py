@@ -44,6 +44,11 @@ LAYER = re.compile(r"[a-z][a-z0-9_]{0,31}")
 REJOIN_SECONDS = 1.0
 """A fleet that finds its router again does not ask in the same moment: up to so long."""
 
+CONFIRM_SECONDS = 60.0
+"""What was said over Zenoh is said over HTTP as well within so long, where it still holds then: on the bus nobody
+confirms that he heard it. A fleet that changes at once does so spread over this time.
+"""
+
 AGAIN_SECONDS = 30.0
 """A robot without Zenoh repeats its status with the first sync after so long."""
 
@@ -108,6 +113,8 @@ class Agent:
         self._said: RobotStatus | None = None
         self._put: RobotStatus | None = None
         self._put_at = 0.0
+        self._on_bus: RobotStatus | None = None
+        self._confirm_at: float | None = None
         self._target: tuple[int, str] | None = None
         self._activated: tuple[str | None, tuple[int, str] | None] | None = None
         self._told: set[str] = set()
@@ -176,7 +183,8 @@ class Agent:
             before = (self._state.marks, self._said)
             pause = self.options.poll_seconds
             try:
-                self._find_router()
+                if not woken or not self._ear.connected:
+                    self._find_router()
                 good = self._sync_and_tell()
                 failures = 0 if good else failures + 1
                 vain = woken and before == (self._state.marks, self._said)
@@ -185,9 +193,23 @@ class Agent:
                 break
             if failures:
                 pause = min(pause, FIRST_PAUSE_SECONDS * 2 ** min(20, failures - 1))
-            woken = self._wait(max(self._after, pause * random.uniform(0.5, 1.5)))  # noqa: S311  jitter is no secret
+            woken = self._rest(max(self._after, pause * random.uniform(0.5, 1.5)))  # noqa: S311  jitter is no secret
 
     # --- what wakes it ---
+
+    def _rest(self, seconds: float) -> bool:
+        """Until something happens, at most so long: whether it did. What is to be confirmed is confirmed meanwhile."""
+        end = time.monotonic() + seconds
+        while True:
+            now = time.monotonic()
+            until = end if self._confirm_at is None else min(end, self._confirm_at)
+            woken = self._wait(max(0.0, until - now))
+            if woken or self._stopping.is_set() or time.monotonic() >= end:
+                return woken
+            try:
+                self._send_status()
+            except Stopped:
+                return False
 
     def _wait(self, seconds: float) -> bool:
         """Until something happens, at most so long: whether an event or the router was it."""
@@ -227,7 +249,7 @@ class Agent:
     def _back(self) -> None:
         self._tell("connected", detail="listening for events over Zenoh")
         self._rejoined = True
-        self._put = None  # who was away may not know how we are
+        self._put = self._on_bus = None  # who was away may not know how we are
         self._wake.set()
 
     def _find_router(self) -> None:
@@ -505,26 +527,35 @@ class Agent:
         self._say("failed", detail=detail)
 
     def _send_status(self) -> None:
-        """Over Zenoh and over HTTP, once for each change; what could not be sent is sent with the next sync.
+        """Over Zenoh at once and over HTTP a little later, or over HTTP at once where nobody is on the bus; once for
+        each change. What could not be sent is sent later.
 
         A robot that is not on the bus says it again now and then: only so does the server know that it is there.
         """
-        status = self._said
+        status, now = self._said, time.monotonic()
         if status is None or self._stopping.is_set():
             return
         on_bus = self._ear is not None and self._ear.connected
-        stale = not on_bus and time.monotonic() - self._put_at > AGAIN_SECONDS
+        stale = not on_bus and now - self._put_at > AGAIN_SECONDS
         if _same(status, self._put) and not stale:
+            self._confirm_at = None
             return
         if on_bus and self._ear is not None:
-            self._ear.put_status(status)
+            if not _same(status, self._on_bus) and self._ear.put_status(status):
+                self._on_bus = status
+            if _same(status, self._on_bus):
+                if self._confirm_at is None:
+                    self._confirm_at = now + CONFIRM_SECONDS * random.uniform(0.25, 1.0)  # noqa: S311
+                if now < self._confirm_at:
+                    return
+        self._confirm_at = now + CONFIRM_SECONDS  # where this try fails
         try:
             self._web.put_status(self._robot, {"environment": self.options.environment, **status.as_dict()})
         except Unavailable:
             return
         except FleetMapError as error:
             self._tell_once("status", detail=f"the server does not take the robot's status: {error.detail}")
-        self._put, self._put_at = status, time.monotonic()
+        self._put, self._put_at, self._confirm_at = status, now, None
 
     def _tell_once(self, what: str, **members: Any) -> None:
         if what not in self._told:

@@ -100,8 +100,8 @@ class Web:
         return [line for line in found if isinstance(line, dict)] if isinstance(found, list) else []
 
     def channels(self, environment: str) -> list[Mapping[str, Any]]:
-        """The channels with what is planned for them."""
-        found = self._json(f"{API}/environments/{quote(environment, safe='')}/channels")
+        """The channels with what is planned for them, without how the fleet stands."""
+        found = self._json(f"{API}/environments/{quote(environment, safe='')}/channels?robots=false")
         return [line for line in found if isinstance(line, dict)] if isinstance(found, list) else []
 
     def changed_layers(self, environment: str, old: int, new: int) -> list[str]:

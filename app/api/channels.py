@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Query
 from starlette.responses import Response
 
 from app import fleet
@@ -20,8 +20,8 @@ from app.store.values import LATEST, Channel, Robot, Rollout, rfc3339
 router = APIRouter(prefix="/environments/{env}/channels", tags=["channels"], route_class=Route)
 
 
-def as_dict(channel: Channel, robots: Sequence[Robot], now: datetime) -> dict[str, Any]:
-    """The channel as clients see it, with how its robots stand. robots: of the environment."""
+def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> dict[str, Any]:
+    """The channel as clients see it, with how its robots stand. robots: of the environment; None leaves that out."""
     planned = None
     if channel.planned is not None:
         planned = {
@@ -30,7 +30,7 @@ def as_dict(channel: Channel, robots: Sequence[Robot], now: datetime) -> dict[st
             "activate_at": rfc3339(channel.planned.activate_at) if channel.planned.activate_at else None,
             "author": channel.planned.author,
         }
-    return {
+    out = {
         "channel": channel.name,
         "version": channel.version,
         "root": channel.root,
@@ -39,8 +39,11 @@ def as_dict(channel: Channel, robots: Sequence[Robot], now: datetime) -> dict[st
         "time": rfc3339(channel.time),
         "planned": planned,
         "rollout": channel.rollout.as_dict() if channel.rollout else None,
-        "robots": fleet.holding(robots, channel, now, channel.planned.root if channel.planned else None).as_dict(),
     }
+    if robots is not None:
+        root = channel.planned.root if channel.planned else None
+        out["robots"] = fleet.holding(robots, channel, now, root).as_dict()
+    return out
 
 
 def _one(here: Services, env: str, channel: Channel) -> dict[str, Any]:
@@ -48,14 +51,21 @@ def _one(here: Services, env: str, channel: Channel) -> dict[str, Any]:
 
 
 @router.get("", responses=told(list[ChannelOut], 404), summary="All channels")
-def list_channels(env: EnvironmentPath, here: Here, _: Viewer) -> Response:
+def list_channels(
+    env: EnvironmentPath,
+    here: Here,
+    _: Viewer,
+    robots: Annotated[
+        bool, Query(description="`false`: without how their robots stand, which costs a look at all.")
+    ] = True,
+) -> Response:
     """`latest` first, then the others by name, with what is planned for them, and how their robots stand.
 
     `robots.since` is told where all robots of a channel hold its root: from then on they have. `holding`, `lagging` and
     `failed` make up the `total`; `ready` have what is planned.
     """
-    robots, now = here.store.robots(env), datetime.now(UTC)
-    return answer([as_dict(channel, robots, now) for channel in here.store.channels(env)])
+    fleet_of, now = here.store.robots(env) if robots else None, datetime.now(UTC)
+    return answer([as_dict(channel, fleet_of, now) for channel in here.store.channels(env)])
 
 
 @router.put("/{channel}", responses=told(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan it")

@@ -640,7 +640,7 @@ class ChannelOut(BaseModel):
     time: datetime
     planned: dict[str, Any] | None = None
     rollout: RolloutOut | None = None
-    robots: ChannelRobotsOut
+    robots: ChannelRobotsOut | None = Field(None, description="Left out with `robots=false`.")
 
 
 class LagOut(BaseModel):

@@ -1,0 +1,383 @@
+"""Events: from a commit to 100 sessions against a bare put to them; 500 robots that come back after a router's restart.
+
+``python -m tests.bench.events put …`` and ``… fleet …`` are the processes that ``latency`` and ``convergence`` start.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import httpx
+import zenoh
+from zenoh import ext
+
+from app.agent.core import Agent, Options
+from app.events import messages
+from app.events.bus import BusOptions, router_configuration
+from app.events.router import Router
+from tests.bench import http
+
+SESSIONS = 100
+COMMITS = 30
+ROBOTS = 500
+PROCESSES = 4
+ALLOWED_MS = 20.0
+CONVERGED_SECONDS = 10.0
+TOKEN = "bench-" + "0" * 40
+ENVIRONMENT = "field"
+
+
+def network(moved: float = 0.0, count: int = 100) -> bytes:
+    """A network; one of its nodes can be moved."""
+    lines = ["name: field", "metric_map: field", "pointset: field", "nodes:"]
+    for k in range(count):
+        x = k + (moved if k == count // 2 else 0.0)
+        lines += [
+            f"- meta: {{map: field, node: n{k}, pointset: field}}",
+            "  node:",
+            f"    name: n{k}",
+            "    parent_frame: map",
+            f"    pose: {{position: {{x: {x}, y: 0.0, z: 0.0}}, orientation: {{w: 1.0, x: 0.0, y: 0.0, z: 0.0}}}}",
+            "    properties: {xy_goal_tolerance: 0.3}",
+            "    verts: []",
+            "    edges:" + ("" if k + 1 < count else " []"),
+        ]
+        if k + 1 < count:
+            lines.append(f"    - {{edge_id: n{k}_n{k + 1}, node: n{k + 1}, action: move_base}}")
+    return ("\n".join(lines) + "\n").encode()
+
+
+@contextlib.contextmanager
+def served(folder: Path, port: int, zenoh_port: int, **more: str) -> Iterator[httpx.Client]:
+    """A server with an environment of one network, and a client of it."""
+    env = {
+        "FLEETMAP_DATA_DIR": str(folder),
+        "FLEETMAP_ADMIN_TOKEN": TOKEN,
+        "FLEETMAP_LOG_LEVEL": "warning",
+        "FLEETMAP_ZENOH_LISTEN": f"tcp/127.0.0.1:{zenoh_port}",
+        **more,
+    }
+    command = [sys.executable, "-m", "app.cli", "serve", "--host", "127.0.0.1", "--port", str(port)]
+    auth = {"Authorization": f"Bearer {TOKEN}"}
+    with (
+        http.serving(command, port, env),
+        httpx.Client(base_url=f"http://127.0.0.1:{port}", headers=auth, timeout=120) as client,
+    ):
+        client.post("/api/v1/environments", json={"name": ENVIRONMENT}).raise_for_status()
+        commit(client, 0.0)
+        deadline = time.monotonic() + 30
+        while client.get("/readyz").json()["events"]["state"] != "connected":
+            if time.monotonic() > deadline:
+                raise RuntimeError("the server finds no router")
+            time.sleep(0.1)
+        yield client
+
+
+def commit(client: httpx.Client, moved: float) -> int:
+    """Another version: its number."""
+    files = [("files", ("n.tmap2.yaml", network(moved)))]
+    answer = client.post(f"/api/v1/environments/{ENVIRONMENT}/versions", files=files)
+    answer.raise_for_status()
+    return int(answer.json()["version"])
+
+
+def open_session(port: int) -> zenoh.Session:
+    """A robot's session."""
+    config = zenoh.Config()
+    for key, value in (
+        ("mode", "client"),
+        ("connect/endpoints", [f"tcp/127.0.0.1:{port}"]),
+        ("scouting/multicast/enabled", False),
+        ("transport/shared_memory/enabled", False),
+    ):
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+# --- from a commit to its event --------------------------------------------------------------------------------------
+
+
+def latency() -> list[dict[str, Any]]:
+    """Half of all deliveries of an event at 100 sessions, from the time in it (taken before its commit), against the
+    same bytes put by a bare session to plain subscribers of the same sessions.
+    """
+    port, zenoh_port = http.free_port(), http.free_port()
+    with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port) as client:
+        sessions = [open_session(zenoh_port) for _ in range(SESSIONS)]
+        arrived: list[tuple[float, bytes]] = []
+        bare: list[tuple[float, bytes]] = []
+
+        def take(sample: zenoh.Sample) -> None:
+            arrived.append((time.time(), bytes(sample.payload)))
+
+        def take_bare(sample: zenoh.Sample) -> None:
+            bare.append((time.time(), bytes(sample.payload)))
+
+        held: list[Any] = []
+        for session in sessions:
+            held.append(
+                ext.declare_advanced_subscriber(
+                    session,
+                    messages.events_key(messages.PREFIX, ENVIRONMENT),
+                    take,
+                    history=ext.HistoryConfig(detect_late_publishers=True),
+                    recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+                )
+            )
+            held.append(session.declare_subscriber("bare/events", take_bare))
+        time.sleep(3.0)
+        arrived.clear()
+        for k in range(COMMITS):
+            before = len(arrived)
+            commit(client, 0.001 * (k + 1))
+            _until(lambda n=before: len(arrived) >= n + SESSIONS)
+            time.sleep(0.05)
+        size = len(arrived[-1][1])
+        command = [sys.executable, "-m", "tests.bench.events", "put", str(zenoh_port), str(COMMITS), str(size)]
+        subprocess.run(command, check=True, timeout=120)
+        _until(lambda: len(bare) >= SESSIONS * COMMITS)
+        ours = [(at - datetime.fromisoformat(json.loads(body)["time"]).timestamp()) * 1e3 for at, body in arrived]
+        floor = [(at - json.loads(body)["time"]) * 1e3 for at, body in bare]
+        for session in sessions:
+            session.close()  # type: ignore[no-untyped-call]
+    mine, peer = statistics.median(ours), statistics.median(floor)
+    complete = len(arrived) == SESSIONS * COMMITS
+    bound = 2 * peer + ALLOWED_MS
+    return [
+        {
+            "what": f"commit → event at {SESSIONS} sessions, p50 (peer: a bare put)",
+            "peer": peer,
+            "ours": mine,
+            "unit": "ms",
+            "ratio": mine / peer,
+            "bound": f"≤ {bound:.1f} ms",
+            "holds": complete and mine <= bound,
+        }
+    ]
+
+
+def put(port: int, count: int, size: int) -> None:
+    """Bare puts of so many bytes, each with the time at which it was handed over."""
+    session = open_session(port)
+    publisher = session.declare_publisher("bare/events", express=True)
+    time.sleep(2.0)
+    for _ in range(count):
+        body = json.dumps({"time": time.time(), "fill": ""})
+        filled = json.dumps({"time": time.time(), "fill": "x" * max(0, size - len(body))})
+        publisher.put(filled.encode())
+        time.sleep(0.15)
+    time.sleep(1.0)
+    session.close()  # type: ignore[no-untyped-call]
+
+
+# --- 500 robots after a router's restart -----------------------------------------------------------------------------
+
+
+class Light(Agent):
+    """An agent that notes the sequences that it hears."""
+
+    def __init__(self, options: Options, say: Any) -> None:
+        self.heard: list[int] = []
+        super().__init__(options, say)
+
+    def _heard(self, event: messages.Event) -> None:
+        self.heard.append(event.sequence)
+        super()._heard(event)
+
+
+def fleet(server: str, zenoh_port: int, folder: str, first: int, count: int) -> None:
+    """So many agents in this process: a line for each thing that matters, until standard input ends."""
+    lock = threading.Lock()
+
+    def tell_as(robot: str) -> Any:
+        def tell(what: str, **members: Any) -> None:
+            if what in ("active", "connected", "failed", "refused"):
+                line = {"robot": robot, "event": what, "at": time.monotonic(), "version": members.get("version")}
+                if what in ("failed", "refused"):
+                    line["detail"] = members.get("detail")
+                with lock:
+                    print(json.dumps(line), flush=True)
+
+        return tell
+
+    agents, threads = [], []
+    for k in range(first, first + count):
+        robot = f"robot-{k}"
+        options = Options(
+            server=server,
+            environment=ENVIRONMENT,
+            formats=("tmap2",),
+            into=Path(folder) / robot,
+            channel="latest",
+            robot=robot,
+            token=TOKEN,
+            poll_seconds=3600.0,
+            zenoh_connect=f"tcp/127.0.0.1:{zenoh_port}",
+            zenoh_prefix=messages.PREFIX,
+        )
+        agent = Light(options, tell_as(robot))
+        agent.open()
+        agents.append(agent)
+        threads.append(threading.Thread(target=agent.run, daemon=True))
+    for thread in threads:
+        thread.start()
+    sys.stdin.read()
+    for agent in agents:
+        agent.stop()
+        heard = sorted(set(agent.heard))
+        with lock:
+            print(json.dumps({"robot": agent.options.robot, "event": "heard", "sequences": heard}), flush=True)
+    os._exit(0)
+
+
+class _Robots:
+    """The fleet's processes, and what their agents said."""
+
+    def __init__(self, server: str, zenoh_port: int, folder: Path) -> None:
+        each = ROBOTS // PROCESSES
+        self.lines: list[dict[str, Any]] = []
+        self._processes = []
+        self._readers = []
+        for k in range(PROCESSES):
+            arguments = ["fleet", server, str(zenoh_port), str(folder), str(k * each), str(each)]
+            process = subprocess.Popen(
+                [sys.executable, "-m", "tests.bench.events", *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            self._processes.append(process)
+            reader = threading.Thread(target=self._read, args=(process,), daemon=True)
+            reader.start()
+            self._readers.append(reader)
+
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            self.lines.append(json.loads(line))
+
+    def times(self, event: str, version: int | None = None, after: float = 0.0) -> dict[str, float]:
+        """Robot -> when it first said so."""
+        out: dict[str, float] = {}
+        for line in list(self.lines):
+            fits = line["event"] == event and (version is None or line.get("version") == version)
+            if fits and line["at"] >= after:
+                out.setdefault(line["robot"], line["at"])
+        return out
+
+    def end(self) -> dict[str, list[int]]:
+        """Stop all: robot -> the sequences that it heard."""
+        for process in self._processes:
+            assert process.stdin is not None
+            process.stdin.close()
+        for process, reader in zip(self._processes, self._readers, strict=True):
+            process.wait(60)
+            reader.join(10)
+        return {line["robot"]: line["sequences"] for line in self.lines if line["event"] == "heard"}
+
+
+def convergence() -> list[dict[str, Any]]:
+    """The router is killed, a change is committed, the router comes back: until all 500 agents drive on the change."""
+    port, zenoh_port = http.free_port(), http.free_port()
+    where = f"tcp/127.0.0.1:{zenoh_port}"
+    options = router_configuration(BusOptions(listen=where))
+    router = Router(options)
+    # 500 robots have 500 disks: here their folders are in memory, where that is to be had.
+    shared = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    disk = Path(tempfile.mkdtemp(dir=shared))
+    more = {"FLEETMAP_ZENOH_MODE": "client", "FLEETMAP_ZENOH_CONNECT": where, "FLEETMAP_ZENOH_ADVERTISE": where}
+    try:
+        with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port, **more) as client:
+            robots = _Robots(f"http://127.0.0.1:{port}", zenoh_port, disk)
+            _until(lambda: len(robots.times("active", 1)) == ROBOTS and len(robots.times("connected")) == ROBOTS, 300)
+            # All hear of a change at once: one conversion.
+            made, at = conversions(client), time.monotonic()
+            second = commit(client, 1.0)
+            _until(lambda: len(robots.times("active", second)) == ROBOTS, 120)
+            heard = max(robots.times("active", second).values()) - at
+            one = conversions(client) - made
+            # And after the router's restart.
+            router._process.kill()
+            router.close()
+            third = commit(client, 2.0)
+            time.sleep(3.0)
+            router = Router(options)
+            back = time.monotonic()
+            if router.problem is not None:
+                raise RuntimeError(router.problem)
+            _until(lambda: len(robots.times("active", third)) == ROBOTS, 120)
+            seconds = max(robots.times("active", third).values()) - back
+            another = conversions(client) - made - one
+            time.sleep(2.0)
+            manifest = client.get(f"/api/v1/environments/{ENVIRONMENT}/versions/latest/manifest?formats=tmap2")
+            last = int(manifest.json()["sequence"])
+            sequences = robots.end()
+            failed = Counter(line.get("detail") for line in robots.lines if line["event"] in ("failed", "refused"))
+            for detail, count in failed.most_common(3):
+                print(f"{count} × {detail}", file=sys.stderr)
+    finally:
+        router.close()
+        shutil.rmtree(disk, ignore_errors=True)
+    lost = sum(not set(range(2, last + 1)) <= set(found) for found in sequences.values())
+    print(f"all {ROBOTS} robots drove on a change {heard:.1f} s after it was sent", file=sys.stderr)
+    row = {"peer": None, "ratio": None}
+    return [
+        {
+            **row,
+            "what": f"{ROBOTS} robots after a router's restart",
+            "ours": seconds,
+            "unit": "s",
+            "bound": f"≤ {CONVERGED_SECONDS:g} s",
+            "holds": seconds <= CONVERGED_SECONDS,
+        },
+        {**row, "what": "… that lost an event", "ours": lost, "unit": "", "bound": "0", "holds": lost == 0},
+        {
+            **row,
+            "what": f"conversions for {ROBOTS} robots",
+            "ours": max(one, another),
+            "unit": "",
+            "bound": "1",
+            "holds": one == another == 1,
+        },
+    ]
+
+
+def conversions(client: httpx.Client) -> int:
+    """Maps that the server has made."""
+    found = re.search(r'fleetmap_conversions_total\{format="tmap2",result="made"\} (\S+)', client.get("/metrics").text)
+    return int(float(found[1])) if found else 0
+
+
+def rows() -> list[dict[str, Any]]:
+    """All of it."""
+    return [*latency(), *convergence()]
+
+
+def _until(condition: Any, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            raise RuntimeError("it did not come about in time")
+        time.sleep(0.02)
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "put":
+        put(*map(int, sys.argv[2:]))
+    else:
+        fleet(sys.argv[2], int(sys.argv[3]), sys.argv[4], int(sys.argv[5]), int(sys.argv[6]))
