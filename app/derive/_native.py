@@ -13,7 +13,6 @@ import ctypes
 import hashlib
 import importlib
 import os
-import pkgutil
 import platform
 import shutil
 import signal
@@ -31,6 +30,8 @@ FOLDER = "NUMBA_CACHE_DIR"
 _KERNELS = "_kernels_"
 """Modules of this name hold kernels and nothing else; they are imported when first needed."""
 
+_PACKAGES = ("derive", "generate")
+"""Folders beside and including this one's that have such modules."""
 
 _PREFIX = "fleetmap-native-"
 _PARENT_DEATH_SIGNAL = 1
@@ -85,15 +86,20 @@ def fill_quietly(where: Path) -> None:
 
 
 def _modules() -> list[str]:
-    package = __name__.rpartition(".")[0]
-    path = [str(Path(__file__).parent)]
-    return sorted(f"{package}.{m.name}" for m in pkgutil.iter_modules(path) if m.name.startswith(_KERNELS))
+    app = __name__.split(".", maxsplit=1)[0]
+    return [f"{app}.{file.parent.name}.{file.stem}" for file in _files()]
+
+
+def _files() -> list[Path]:
+    """The modules that hold kernels."""
+    app = Path(__file__).parents[1]
+    return sorted(file for package in _PACKAGES for file in (app / package).glob(f"{_KERNELS}*.py"))
 
 
 def _key() -> str:
     """A name for what compiled code depends on besides the processor, which numba itself looks at."""
     digest = hashlib.blake2b(digest_size=8)
-    for file in sorted(Path(__file__).parent.glob(f"{_KERNELS}*.py")):
+    for file in _files():
         digest.update(file.read_bytes())
     parts = (metadata.version("numba"), metadata.version("numpy"), platform.python_version(), platform.machine())
     digest.update(repr(parts).encode())

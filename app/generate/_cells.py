@@ -1,0 +1,206 @@
+"""From a grid to a site: occupied cells become objects whose slice is that grid again, and the rest follows.
+
+The outline of each piece of occupied cells is kept cell by cell: a box where the piece is a rectangle, else its outline
+extruded. Rows of the arrays are counted from below, as in ``OccupancyGrid``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.derive.occupancy_to_topology import Parameters, network
+from app.errors import CannotConvert, CannotGenerate
+from app.generate import MAX_CELLS, MAX_OBJECTS
+from app.generate._site import Site, SiteOptions, refused
+from app.model.features import Features
+from app.model.frame import GROUND
+from app.model.grid import OccupancyGrid
+from app.model.layers import MAP, NETWORK, Layers, Part, PartKey
+
+Bool = NDArray[np.bool_]
+
+BLOCK = 64
+"""Cells along a side of the pieces into which one with a long outline is cut: solids of many corners are slow."""
+
+LONG = 400
+"""Corners of such an outline."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What occupied cells are: a kind, its height in metres and its colour in the picture."""
+
+    kind: str
+    height: float
+    colour: str
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a grid lies: its lower left corner in metres, metres a cell, cells along x and y."""
+
+    x: float
+    y: float
+    resolution: float
+    columns: int
+    rows: int
+
+    @property
+    def box(self) -> Any:
+        """Its outline, a polygon in metres."""
+        right, top = self.x + self.columns * self.resolution, self.y + self.rows * self.resolution
+        return shapely.box(self.x, self.y, round(right, 3), round(top, 3))
+
+
+def placed(site: Site, width: float, depth: float, resolution: float, *, step: int = 1) -> Place:
+    """The grid of a site: around its fence where the environment has one, else width × depth metres from the origin.
+
+    step: the sides are whole numbers of so many cells. Raises CannotGenerate before anything is made: for too many
+    cells, or cells that are not whole millimetres, which is what coordinates are kept in.
+    """
+    if abs(resolution * 1000 - round(resolution * 1000)) > 1e-6:
+        raise refused("resolution", f"must be whole millimetres, got {resolution:g} m")
+    size = resolution * step
+    if width / size * (depth / size) * step * step > MAX_CELLS:
+        raise refused(
+            "width",
+            f"{width:g} × {depth:g} m would be more than {MAX_CELLS} cells of {resolution:g} m: make it smaller",
+        )
+    low_x, low_y, high_x, high_y = site.bounded(shapely.box(0.0, 0.0, width, depth)).bounds
+    if not site.is_given:
+        columns, rows = (max(1, round(v / size)) for v in (width, depth))
+        found = Place(0.0, 0.0, resolution, columns * step, rows * step)
+        site.fence = found.box
+        return found
+    x, y = (math.floor(v / resolution + 1e-6) for v in (low_x, low_y))
+    columns, rows = (math.ceil((v - o * resolution) / size - 1e-6) for v, o in ((high_x, x), (high_y, y)))
+    if columns * rows * step * step > MAX_CELLS:
+        raise refused("resolution", f"the fence would hold more than {MAX_CELLS} cells of {resolution:g} m")
+    return Place(round(x * resolution, 3), round(y * resolution, 3), resolution, columns * step, rows * step)
+
+
+def stand(site: Site, place: Place, occupied: Bool, seen: Look) -> None:
+    """Put an object for each piece of occupied cells (joined by their sides), which all look the same."""
+    pieces = _pieces(occupied)
+    if len(pieces) > MAX_OBJECTS:
+        raise CannotGenerate(f"the site would have {len(pieces)} objects, the limit is {MAX_OBJECTS}: make it smaller")
+    numbers: dict[str, int] = {}
+    floor = site.elevation(GROUND)
+    shapely.prepare(site.fence)
+    for outline in pieces:
+        area = shapely.transform(outline, lambda at: np.round(at * place.resolution + [place.x, place.y], 3) + 0.0)
+        if site.is_given and not site.fence.intersects(area):
+            continue
+        numbers[seen.kind] = numbers.get(seen.kind, 0) + 1
+        i = f"{seen.kind}/{numbers[seen.kind]}"
+        low_x, low_y, high_x, high_y = area.bounds
+        if len(outline.exterior.coords) == 5 and not outline.interiors:
+            at = ((low_x + high_x) / 2, (low_y + high_y) / 2)
+            size = [round(high_x - low_x, 3), round(high_y - low_y, 3), seen.height]
+            solid: dict[str, Any] = {"type": "box", "size": size, "pose": [0.0, 0.0, seen.height / 2, 0.0, 0.0, 0.0]}
+            if any(round(v * 1000) % 2 for v in size[:2]):  # its middle is no whole millimetre: it stands at its corner
+                at = (low_x, low_y)
+                solid["pose"][:2] = [round(v / 2, 4) for v in size[:2]]
+            words: dict[str, Any] = {"size": size}
+        else:
+            at = (low_x, low_y)
+            rings = [area.exterior, *area.interiors]
+            points = [(np.round(shapely.get_coordinates(r)[:-1] - at, 3) + 0.0).tolist() for r in rings]
+            solid = {"type": "polyline", "points": points, "height": seen.height}
+            words = {"height": seen.height}
+        pose = (*at, floor, 0.0)
+        site.put(i, seen.kind, area, shapes=[solid], pose=pose, colour=seen.colour, **words)
+
+
+def finished(site: Site, options: SiteOptions, notes: Notes, *, ground: str) -> Layers:
+    """The site's layers with the network of its grid: the largest piece of what its robot can reach."""
+    made = site.finish(ground=ground)
+    grid = made.parts[PartKey("occupancy", GROUND, MAP)]
+    if not isinstance(grid, OccupancyGrid):
+        raise TypeError("a site has a grid")
+    ways = ways_of(grid, options.robot_radius, notes)
+    parts: dict[PartKey, Part] = dict(made.parts)
+    if ways is not None:
+        parts[PartKey("topology", GROUND, NETWORK)] = ways
+    return Layers(dict(sorted(parts.items())), made.datum, made.levels)
+
+
+def ways_of(grid: OccupancyGrid, radius: float, notes: Notes) -> Features | None:
+    """The network of a grid's free space, one piece of it; None, with a warning, where a robot finds no way."""
+    own = Notes()
+    spacing = max(1.5, 25 * grid.resolution)
+    try:
+        found = network(grid, Parameters(robot_radius=radius, spacing=spacing), own, "the grid")
+    except CannotConvert as error:
+        notes.warn(f"there is no network: {error.detail}")
+        return None
+    notes.dropped += own.dropped
+    return _largest(found, notes)
+
+
+def _largest(network: Features, notes: Notes) -> Features:
+    """The largest piece of a network, by its nodes."""
+    place = network.index()
+    parent = list(range(len(network)))
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
+        return i
+
+    for k, said in enumerate(network.properties):
+        if said.get("kind") == "edge":
+            for end in (said["source"], said["target"]):
+                parent[root(k)] = root(place[end])
+    roots = np.array([root(k) for k in range(len(network))])
+    nodes = np.array([said.get("kind") == "node" for said in network.properties])
+    which, counts = np.unique(roots[nodes], return_counts=True)
+    kept = roots == which[int(np.argmax(counts))]
+    notes.drop("nodes", int(np.count_nonzero(nodes & ~kept)), "in places from which the robot finds no way to the rest")
+    return network.take(kept)
+
+
+def _pieces(occupied: Bool) -> list[Any]:
+    """The outline in cells of each piece, from below and from the left; those with long outlines in several."""
+    if not occupied.any():
+        return []
+    rows, columns = occupied.shape
+    outlines = _outlines(occupied.astype(np.int32))
+    long = [p for p in outlines if shapely.count_coordinates(p) > LONG]
+    if long:
+        inside = _mask(long, occupied.shape) & occupied
+        block = np.arange(rows)[:, None] // BLOCK * (columns // BLOCK + 1) + np.arange(columns)[None, :] // BLOCK + 1
+        outlines = [p for p in outlines if shapely.count_coordinates(p) <= LONG]
+        outlines += _outlines(np.where(inside, block, 0).astype(np.int32))
+    return sorted(outlines, key=lambda p: (p.bounds[1], p.bounds[0], p.wkb))
+
+
+def _outlines(label: NDArray[np.int32]) -> list[Any]:
+    from rasterio import features  # type: ignore[import-untyped]
+
+    found = features.shapes(label, mask=label > 0, connectivity=4)
+    return [shapely.normalize(shapely.geometry.shape(s)) for s, _ in found]
+
+
+def _mask(areas: list[Any], shape: tuple[int, int]) -> Bool:
+    from rasterio import features
+
+    return np.asarray(features.rasterize([(area, 1) for area in areas], shape, dtype=np.uint8) > 0)
+
+
+LOOKS: Mapping[str, Look] = {
+    "wall": Look("wall", 2.5, "wall"),
+    "rack": Look("rack", 2.0, "shelf"),
+    "furniture": Look("furniture", 0.8, "furniture"),
+    "obstacle": Look("obstacle", 1.5, "goods"),
+    "rock": Look("rock", 2.5, "wall"),
+}

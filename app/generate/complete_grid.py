@@ -1,0 +1,172 @@
+"""The unknown part of a grid from its known part: wave-function collapse with the known cells fixed (``_wfc``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.derive._grids import called, chosen
+from app.errors import CannotGenerate
+from app.generate import MAX_CELLS, Source, _wfc, generates
+from app.generate._site import refused
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import Layers, Part, PartKey
+from app.parameters import parameter
+
+U8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+MOST = 2**20
+"""Cells that are filled in at once."""
+
+REPAIRS = 100_000
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How far it goes, and how it learns."""
+
+    grid: str | None = parameter(None, "which grid; default: map, else the only one of a level that is no filter mask")
+    reach: float = parameter(
+        1.0, "unknown cells nearer than this to a known one are filled in; 0: all of them", minimum=0.0, maximum=1e6
+    )
+    pattern: int = parameter(3, "cells along a window", minimum=2, maximum=3)
+    symmetry: Literal["none", "mirror", "rotate", "all"] = parameter(
+        "all", "whether what is known is also taken mirrored, turned by quarters, or both"
+    )
+    order: Literal["rows", "entropy"] = parameter(
+        "entropy", "what is decided next: where the entropy is least, from what is known inwards, or row by row"
+    )
+
+
+@generates({"occupancy"}, parameters=Options, needs={"occupancy"})
+def complete_grid(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
+    """A grid's unknown cells, made up such that they look like the known ones.
+
+    Known cells stay as they are. Every window of the result stands somewhere in the known part where that can be; how
+    many do not is told. Raises CannotGenerate where nothing is unknown, no window is known, or too much is to be filled.
+    """
+    parts: dict[PartKey, Part] = {}
+    why = ""
+    for key, grid in chosen(given, options.grid, "obstacles").items():
+        if not (grid.cells == UNKNOWN).any():
+            why = f"{called(key)} has no unknown cell"
+            continue
+        parts[key] = _completed(grid, options, source, notes, key)
+    if not parts:
+        raise CannotGenerate(f"{why}: there is nothing to fill in")
+    return Layers(parts, given.datum, given.levels)
+
+
+def _completed(grid: OccupancyGrid, options: Options, source: Source, notes: Notes, key: PartKey) -> OccupancyGrid:
+    name = called(key)
+    if grid.cells.size > MAX_CELLS:
+        raise CannotGenerate(f"{name} has {grid.cells.size} cells, the limit is {MAX_CELLS}")
+    known = grid.cells != UNKNOWN
+    wanted = _wanted(known, options.reach / grid.resolution)
+    count = int(np.count_nonzero(wanted))
+    if count > MOST:
+        raise refused("reach", f"{name}: {count} cells would be filled in, the limit is {MOST}: give a smaller reach")
+    if not count:
+        raise refused("reach", f"{name}: no unknown cell is that near to a known one: give a larger reach")
+    occupied = known & (grid.cells >= grid.occupied_thresh * OCCUPIED)
+    n = options.pattern
+    counts = _counts(occupied, known, n, options.symmetry)
+    if not counts.any():
+        raise CannotGenerate(f"{name}: no window of {n} × {n} cells is known all over, so nothing can be learned")
+    # Only what is near the wanted cells is looked at.
+    rows, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
+    y0, y1 = max(int(rows[0]) - n, 0), int(rows[-1]) + n + 1
+    x0, x1 = max(int(columns[0]) - n, 0), int(columns[-1]) + n + 1
+    part = np.s_[y0:y1, x0:x1]
+    tiles = _filled(occupied[part], known[part], wanted[part], counts, options, source, notes, key)
+    cells = grid.cells.copy()
+    inside = cells[part]
+    inside[wanted[part]] = np.where(tiles == 1, OCCUPIED, FREE).astype(np.uint8)[wanted[part]]
+    return replace(grid, cells=cells)
+
+
+def _filled(
+    occupied: Bool,
+    known: Bool,
+    wanted: Bool,
+    counts: NDArray[np.int64],
+    options: Options,
+    source: Source,
+    notes: Notes,
+    key: PartKey,
+) -> NDArray[np.int64]:
+    """0 and 1 for each cell of a window of the grid, -1 where nothing was made."""
+    n = options.pattern
+    codes = np.arange(2 ** (n * n))
+    patterns = (codes[:, None] >> np.arange(n * n) & 1).reshape(-1, n, n).astype(np.int64)
+    tiles = np.array([FREE, OCCUPIED], np.uint8).reshape(2, 1, 1)
+    model = _wfc.Model(tiles, patterns, _wfc.scaled(counts), _wfc.agreeing(patterns))
+    lattice = _wfc.Lattice.of(wanted.shape, n, wanted=wanted)
+    if not len(lattice.rows):
+        raise CannotGenerate(f"{called(key)} is smaller than a window of {n} × {n} cells")
+    wider = lattice.fitting(patterns, np.where(known, occupied.astype(np.int8), np.int8(-1)))
+    seen = _wfc.packed((counts > 0)[None])
+    narrow = wider & seen
+    empty = ~narrow.any(axis=1)
+    narrow[empty] = wider[empty]
+    repairs = 0
+    for attempt in range(_wfc.ATTEMPTS):
+        draw = source.stream(f"{key.level}/{key.name}/{attempt}")
+        wave = _wfc.Wave.start(
+            model,
+            lattice,
+            narrow.copy(),
+            draw,
+            balance=_wfc.BALANCE,
+            repairs=REPAIRS,
+            scan=options.order == "rows",
+            wider=wider,
+        )
+        ended = wave.run()
+        repairs = int(wave.report[0])
+        if ended == _wfc.DONE:
+            strange = int(np.count_nonzero(~(wave.domain & seen).any(axis=1)))
+            if strange:
+                notes.warn(
+                    f"{strange} of {len(lattice.rows)} windows that were filled in stand nowhere in the known part: no "
+                    "others fit between the known cells",
+                    where=called(key),
+                )
+            return wave.tiles()
+    raise CannotGenerate(
+        f"{called(key)}: {repairs} contradictions could not be repaired: give a smaller pattern or reach"
+    )
+
+
+def _wanted(known: Bool, reach: float) -> Bool:
+    """The unknown cells within so many cells of a known one (middle to middle); all where reach is 0."""
+    import cv2
+
+    if not reach or not known.any():
+        return ~known
+    away = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return ~known & (np.asarray(away) <= reach + 1e-4)
+
+
+def _counts(occupied: Bool, known: Bool, n: int, symmetry: _wfc.Symmetry) -> NDArray[np.int64]:
+    """How often each window stands where all is known, by its cells as bits, row by row from below: int64 [2^(n·n)]."""
+    height, width = (v - n + 1 for v in known.shape)
+    counts = np.zeros(2 ** (n * n), np.int64)
+    if height < 1 or width < 1:
+        return counts
+    code, good = np.zeros((height, width), np.int16), np.ones((height, width), bool)
+    for k in range(n * n):
+        window = np.s_[k // n : k // n + height, k % n : k % n + width]
+        code |= occupied[window].astype(np.int16) << k
+        good &= known[window]
+    plain = np.bincount(code[good], minlength=len(counts))
+    for order in _wfc.turned(np.arange(n * n).reshape(n, n), symmetry):
+        codes = np.arange(len(counts))
+        moved = sum((codes >> int(k) & 1) << i for i, k in enumerate(order.ravel()))
+        np.add.at(counts, np.asarray(moved, np.int64), plain)
+    return counts

@@ -1,0 +1,244 @@
+"""Wave-function collapse: a site of which every small window stands in a sample (Gumin 2016; ``_wfc``).
+
+The sample is one of ours, 5 m × 5 m, or a grid of the environment. With ``order=rows`` the shares of tiles and of
+neighbours stay near the sample's; where the least entropy decides what comes next, rare patterns become rarer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.errors import CannotGenerate, Problem
+from app.generate import Source, _cells, _wfc, generates
+from app.generate._cells import LOOKS, Look
+from app.generate._site import Site, SiteOptions, refused
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import Layers
+from app.parameters import parameter
+
+U8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+SIDE = 5.0
+"""Metres of our own samples."""
+
+RESOLUTION = 0.05
+
+MOST_SAMPLE = 2**18
+"""Tiles of a sample."""
+
+WALL = 0.1
+"""Metres of a site's outer wall, at least one tile."""
+
+BORDER = 99
+"""How cells of the outer wall are told from what stands inside."""
+
+Rectangles = tuple[tuple[float, float, float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """A place to learn from: rectangles (x, y, width, depth in metres) of what stands there."""
+
+    look: Look
+    rectangles: Rectangles
+
+    def cells(self, resolution: float) -> U8:
+        """The sample as a grid: 0 free, 100 occupied; row 0 is the lowest."""
+        n = max(1, round(SIDE / resolution))
+        out = np.full((n, n), FREE, np.uint8)
+        for x, y, w, d in self.rectangles:
+            x0, y0, x1, y1 = (round(v / resolution) for v in (x, y, x + w, y + d))
+            out[y0 : max(y1, y0 + 1), x0 : max(x1, x0 + 1)] = OCCUPIED
+        return out
+
+
+PILLARS = (0.4, 1.65, 2.9, 4.15)
+
+SAMPLES: Mapping[str, Sample] = {
+    "warehouse": Sample(
+        LOOKS["rack"],
+        (
+            *((x, y, 1.4, 0.4) for y in (0.7, 1.8, 2.9) for x in (0.8, 2.9)),
+            *((x, 4.0, 0.2, 0.2) for x in (1.0, 3.0)),
+        ),
+    ),
+    "office": Sample(
+        LOOKS["furniture"],
+        (
+            *((x, y, 0.8, 0.4) for y in (0.6, 1.4, 3.2, 4.0) for x in (0.6, 1.9)),
+            *((x, y, 0.4, 0.4) for y in (0.6, 1.6, 3.0, 4.2) for x in (3.3, 4.2)),
+        ),
+    ),
+    "pillars": Sample(
+        LOOKS["wall"], tuple((x, y, 0.4, 0.4) for x in (0.4, 1.65, 2.9, 4.15) for y in (0.4, 1.65, 2.9, 4.15))
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Options(SiteOptions):
+    """The sample, what is learned of it, and what is made."""
+
+    sample: str = parameter(
+        "warehouse", f"one of {', '.join(SAMPLES)}, or the name of a grid of the environment; its cells are the site's"
+    )
+    width: float = parameter(10.0, "along x, where no fence says it", minimum=0.5, maximum=10_000.0, unit="m")
+    depth: float = parameter(10.0, "along y, where no fence says it", minimum=0.5, maximum=10_000.0, unit="m")
+    model: Literal["overlapping", "tiled"] = parameter(
+        "overlapping", "every window of tiles stands in the sample, or only every pair of neighbours"
+    )
+    pattern: int | None = parameter(
+        None, "overlapping: tiles along a window [5]; more is truer, and harder to go on from", minimum=2, maximum=8
+    )
+    tile: int | None = parameter(None, "cells along a tile [overlapping: 1, tiled: 2]", minimum=1, maximum=64)
+    symmetry: Literal["none", "mirror", "rotate", "all"] = parameter(
+        "none", "whether the sample is also taken mirrored, turned by quarters, or both"
+    )
+    wrap: bool = parameter(False, "whether the sample goes on at its other side")
+    border: Literal["walls", "open", "periodic"] = parameter(
+        "walls", "closed by walls; cut out of something larger; or such that copies fit side by side"
+    )
+    order: Literal["rows", "entropy"] = parameter(
+        "rows", "what is decided next: row by row, true to the sample's shares, or where the entropy is least"
+    )
+    connected: bool = parameter(True, "whether all free cells are to be one piece")
+    free: tuple[float, ...] = parameter((), "x,y,x,y,…: places that stay free", unit="m")
+    blocked: tuple[float, ...] = parameter((), "x,y,x,y,…: places that are to be occupied", unit="m")
+    repairs: int = parameter(
+        20_000, "contradictions in one attempt after which it is given up", minimum=0, maximum=1_000_000
+    )
+
+
+@generates(
+    {"location", "objects", "occupancy", "topology", "imagery"},
+    parameters=Options,
+    also={"location", "occupancy"},
+)
+def wave_function_collapse(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
+    """Wave-function collapse: a place every window of which stands in a sample.
+
+    Raises CannotGenerate for a sample that is not there, too large or too varied, for fixed places that contradict it,
+    and where all attempts fail.
+    """
+    sample, known, resolution, look = _sample(given, options, notes)
+    pattern = _pattern(options)
+    tile = options.tile or (1 if options.model == "overlapping" else 2)
+    sample, known = _whole(sample, known, tile, notes)
+    if sample.size > MOST_SAMPLE * tile * tile:
+        raise refused("sample", f"has {sample.size // tile**2} tiles, the limit is {MOST_SAMPLE}: give a larger tile")
+    site = Site(given, options, notes)
+    place = _cells.placed(site, options.width, options.depth, resolution, step=tile)
+    if options.wrap and options.border == "walls":
+        raise refused("wrap", "a sample that goes on at its other side has no walls: give border=open or periodic")
+    thick = max(1, round(WALL / (resolution * tile))) if options.border == "walls" else 0
+    rows, columns = place.rows // tile, place.columns // tile
+    if min(rows, columns) < max(pattern, 2 * thick + 1):
+        least = max(pattern, 2 * thick + 1) * tile * resolution
+        raise refused("width", f"{columns} × {rows} tiles are too few: at least {least:g} m along each side are needed")
+    if thick:
+        ring = max(pattern - 1, thick) * tile
+        sample = np.pad(sample, ring, constant_values=BORDER)
+        known = np.pad(known, ring, constant_values=True)
+    model = _wfc.learn(sample, tile=tile, pattern=pattern, symmetry=options.symmetry, wrap=options.wrap, known=known)
+    open_ = (model.tiles == FREE).all(axis=(1, 2))
+    full = (model.tiles == OCCUPIED).all(axis=(1, 2))
+    fixed = np.full((rows, columns), -1, np.int64)
+    wall = -1
+    if thick:
+        wall = _only((model.tiles == BORDER).all(axis=(1, 2)), "border", "a wall tile")
+        fixed[:thick], fixed[-thick:], fixed[:, :thick], fixed[:, -thick:] = wall, wall, wall, wall
+    size = resolution * tile
+    for where, mask, what in (("free", open_, "a free tile"), ("blocked", full, "an occupied tile")):
+        for x, y in _points(getattr(options, where), where):
+            r, c = int((y - place.y) // size), int((x - place.x) // size)
+            if not (0 <= r < rows and 0 <= c < columns):
+                raise refused(where, f"({x:g}, {y:g}) lies outside of the site")
+            number = _only(mask, where, what)
+            if fixed[r, c] not in (-1, number):
+                raise refused(where, f"({x:g}, {y:g}) lies on a wall, or is to be free and occupied")
+            fixed[r, c] = number
+    tiles = _wfc.collapsed(
+        model,
+        (rows, columns),
+        fixed,
+        source.stream,
+        periodic=options.border == "periodic",
+        scan=options.order == "rows",
+        joined=options.connected,
+        repairs=options.repairs,
+        wall=wall,
+    )
+    cells = _wfc.rendered(model, tiles)
+    _cells.stand(site, place, cells == BORDER, LOOKS["wall"])
+    _cells.stand(site, place, cells == OCCUPIED, look)
+    return _cells.finished(site, options, notes, ground="concrete")
+
+
+def _pattern(options: Options) -> int:
+    if options.model == "overlapping":
+        return options.pattern or 5
+    if options.pattern is not None:
+        raise refused("pattern", "belongs to model=overlapping: a tiled model knows only neighbours")
+    return 1
+
+
+def _sample(given: Layers, options: Options, notes: Notes) -> tuple[U8, Bool, float, Look]:
+    """(cells of 0 and 100, which of them are known, metres a cell, what its obstacles are)."""
+    grids = {key.name: grid for key, grid in reversed(given.grids().items())}
+    if options.sample in SAMPLES and options.sample not in grids:
+        own = SAMPLES[options.sample]
+        resolution = options.resolution or RESOLUTION
+        cells = own.cells(resolution)
+        return cells, np.ones(cells.shape, bool), resolution, own.look
+    grid = grids.get(options.sample)
+    if grid is None:
+        there = ", ".join(sorted(grids)) or "none"
+        raise refused(
+            "sample",
+            f"there is no sample {options.sample[:80]!r}: give one of {', '.join(SAMPLES)}, or a grid ({there})",
+        )
+    resolution = round(grid.resolution, 3)
+    if options.resolution is not None and abs(options.resolution - grid.resolution) > 1e-6:
+        raise refused("resolution", f"is the sample's, {grid.resolution:g} m: leave it out")
+    if resolution != grid.resolution:
+        notes.fill("resolution", resolution, f"the sample's {grid.resolution!r} m in whole millimetres")
+    return *binary(grid), resolution or RESOLUTION, LOOKS["obstacle"]
+
+
+def binary(grid: OccupancyGrid) -> tuple[U8, Bool]:
+    """A grid's cells as 0 and 100, by its threshold, and which of them are known."""
+    known = grid.cells != UNKNOWN
+    occupied = known & (grid.cells >= grid.occupied_thresh * OCCUPIED)
+    return np.where(occupied, OCCUPIED, FREE).astype(np.uint8), known
+
+
+def _whole(cells: U8, known: Bool, tile: int, notes: Notes) -> tuple[U8, Bool]:
+    """A sample of whole tiles."""
+    rows, columns = (n // tile * tile for n in cells.shape)
+    lost = cells.size - rows * columns
+    if not rows * columns:
+        raise refused("tile", f"the sample of {cells.shape[1]} × {cells.shape[0]} cells is smaller than one tile")
+    notes.drop("cells of the sample", lost, f"beyond the last whole tile of {tile} cells")
+    return cells[:rows, :columns], known[:rows, :columns]
+
+
+def _only(mask: Bool, where: str, what: str) -> int:
+    found = np.flatnonzero(mask)
+    if not len(found):
+        raise refused(where, f"the sample has no {what.split(' ', 1)[1]} of this size: give a smaller tile")
+    return int(found[0])
+
+
+def _points(numbers: tuple[float, ...], where: str) -> list[tuple[float, float]]:
+    if len(numbers) % 2:
+        raise CannotGenerate(
+            f"{where}: an even number of coordinates is needed", [Problem("x,y,x,y,… is needed", where=where)]
+        )
+    return list(zip(numbers[::2], numbers[1::2], strict=True))
