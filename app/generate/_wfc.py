@@ -36,10 +36,10 @@ MOST_WEIGHT = 2**16
 """What all patterns weigh together, about: entropies are read from a table of this length."""
 
 WORK = 3_000_000_000
-"""Words of 64 patterns that are looked at before it is given up: a minute or so."""
+"""Words of 64 patterns that are looked at before an attempt is given up: some minutes."""
 
-MEMORY = 2**30
-"""Bytes of all domains together, times two: they are kept as they are and as they were."""
+MOST_PLACES = 2**22
+"""Tiles of a result."""
 
 BALANCE = 300
 """Places that smooth what has been placed so far, when patterns are weighed by it."""
@@ -408,12 +408,11 @@ def collapsed(
     entropy is least. joined: all free cells are to be one piece, by their sides. CannotGenerate where that cannot be
     had.
     """
-    lattice = Lattice.of(shape, model.size, periodic=periodic)
-    if 2 * len(lattice.rows) * model.words * 8 > MEMORY:
+    if shape[0] * shape[1] > MOST_PLACES:
         raise CannotGenerate(
-            f"{len(lattice.rows)} places with {len(model.patterns)} patterns each are too many: make it smaller, or "
-            "give larger tiles or a smaller pattern"
+            f"{shape[1]} × {shape[0]} tiles are more than {MOST_PLACES}: make it smaller, or give larger tiles"
         )
+    lattice = Lattice.of(shape, model.size, periodic=periodic)
     initial = lattice.fitting(model.patterns, fixed, wall)
     free = fixed[(lattice.rows + model.size - 1) % shape[0], (lattice.columns + model.size - 1) % shape[1]] == -1
     why = ""
@@ -529,7 +528,8 @@ def _mend(wave: Wave, piece: Bool, main: Bool, *, close: bool) -> None:
     if any(not domain.any() for domain in touched.values()):
         return
     before = wave.domain.copy(), wave.initial.copy()
-    near = np.unique(np.fromiter(touched, np.int64))
+    whole = place[rows, columns]  # the piece itself
+    near = np.union1d(np.fromiter(touched, np.int64), whole[whole >= 0])
     for _ in range(2 * model.size):
         around = wave.lattice.neighbours[near].ravel()
         near = np.union1d(near, around[around >= 0])

@@ -48,7 +48,8 @@ def complete_grid(given: Layers, options: Options, source: Source, notes: Notes)
     """A grid's unknown cells, made up such that they look like the known ones.
 
     Known cells stay as they are. Every window of the result stands somewhere in the known part where that can be; how
-    many do not is told. Raises CannotGenerate where nothing is unknown, no window is known, or too much is to be filled.
+    many do not is told. Raises CannotGenerate where nothing is unknown, no window is known, or too much is to be
+    filled in.
     """
     parts: dict[PartKey, Part] = {}
     why = ""

@@ -1,0 +1,317 @@
+"""Wave-function collapse: every window stands in the sample, in its shares, whatever is fixed; grids are completed."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from app import generate
+from app.cli import run
+from app.derive import Notes
+from app.errors import CannotGenerate, Invalid, MissingLayer
+from app.generate import Source, _wfc
+from app.generate.wave_function_collapse import SAMPLES
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import Layers, PartKey
+from tests.api.conftest import Api
+from tests.generate import looks
+
+NAME = "wave_function_collapse"
+GRID = PartKey("occupancy")
+DRAW = Source(7, "tests").stream
+CELLS = "133544c3d3efcb5f"
+COMPLETED = "db80781a61463687"
+U8 = NDArray[np.uint8]
+
+SHARE = 0.05
+"""How far the share of occupied tiles, and of each pair of neighbours, may be from the sample's on 10 m × 10 m."""
+
+
+def windows(cells: U8, n: int) -> set[bytes]:
+    """All windows of n × n cells."""
+    found = np.lib.stride_tricks.sliding_window_view(cells, (n, n)).reshape(-1, n * n)
+    return {row.tobytes() for row in np.unique(found, axis=0)}
+
+
+def made(sample: U8, size: int, pattern: int, draw: Any = DRAW, symmetry: Any = "none", **more: Any) -> U8:
+    """A grid of so many cells a side from a sample."""
+    model = _wfc.learn(sample, tile=1, pattern=pattern, symmetry=symmetry, wrap=more.pop("wrap", False))
+    fixed = more.pop("fixed", np.full((size, size), -1))
+    return _wfc.rendered(model, _wfc.collapsed(model, (size, size), fixed, draw, **more))
+
+
+def pairs(cells: U8) -> list[float]:
+    """Shares of the pairs of neighbours, along x and along y."""
+    full = (cells == OCCUPIED).astype(int)
+    both = (2 * full[:, :-1] + full[:, 1:], 2 * full[:-1] + full[1:])
+    return [float((p == k).mean()) for p in both for k in range(4)]
+
+
+def board() -> U8:
+    return np.asarray((np.indices((4, 4)).sum(axis=0) % 2 * OCCUPIED), np.uint8)
+
+
+def rooms() -> U8:
+    """A room with two doors: what is made of it falls apart here and there unless that is forbidden."""
+    out = np.zeros((16, 16), np.uint8)
+    out[3:12, 3:12] = OCCUPIED
+    out[4:11, 4:11] = FREE
+    out[6:8, 3] = out[11, 7:10] = FREE
+    return out
+
+
+def test_a_board_of_two_colours_has_two_patterns() -> None:
+    model = _wfc.learn(board(), tile=1, pattern=2, symmetry="all", wrap=True)
+    assert model.patterns.tolist() == [[[0, 1], [1, 0]], [[1, 0], [0, 1]]]
+    assert model.weights[0] == model.weights[1]
+    assert model.allowed[:, :, 0].tolist() == [[2, 1]] * 4  # beside the one stands the other, in each direction
+    for border in (False, True):
+        out = made(board(), 10, 2, wrap=True, periodic=border)
+        assert windows(out, 2) == windows(board(), 2)
+
+
+def test_tiles_stand_side_by_side_as_in_the_sample() -> None:
+    sample = SAMPLES["warehouse"].cells(0.05)
+    model = _wfc.learn(sample, tile=4, pattern=1, symmetry="none")
+    tiles = _wfc.collapsed(model, (30, 40), np.full((30, 40), -1), DRAW)
+    blocks = sample.reshape(25, 4, 25, 4).transpose(0, 2, 1, 3).reshape(25, 25, 16)
+    known = [
+        {(a.tobytes(), b.tobytes()) for a, b in zip(p.reshape(-1, 16), q.reshape(-1, 16), strict=True)}
+        for p, q in ((blocks[:, :-1], blocks[:, 1:]), (blocks[:-1], blocks[1:]))
+    ]
+    here = model.tiles[tiles].reshape(30, 40, 16)
+    for seen, p, q in ((known[0], here[:, :-1], here[:, 1:]), (known[1], here[:-1], here[1:])):
+        assert {(a.tobytes(), b.tobytes()) for a, b in zip(p.reshape(-1, 16), q.reshape(-1, 16), strict=True)} <= seen
+    assert len(np.unique(tiles)) > 5
+
+
+@pytest.mark.parametrize("scan", [True, False])
+@pytest.mark.parametrize("symmetry", ["none", "mirror", "rotate", "all"])
+def test_every_window_stands_in_the_sample(scan: bool, symmetry: Any) -> None:
+    sample = SAMPLES["office"].cells(0.1)
+    sample[5:9, 40] = OCCUPIED
+    known = set().union(*(windows(np.ascontiguousarray(one), 3) for one in _wfc.turned(sample, symmetry)))
+    out = made(sample, 60, 3, symmetry=symmetry, scan=scan)
+    assert windows(out, 3) <= known
+    wide = made(sample, 40, 3, symmetry=symmetry, scan=scan, periodic=True)
+    assert windows(np.pad(wide, ((0, 2), (0, 2)), mode="wrap"), 3) <= known
+
+
+def test_ten_metres_keep_the_shares_of_the_sample_and_their_time() -> None:
+    sample = SAMPLES["warehouse"].cells(0.05)
+    looks.make(NAME, width=3, depth=3)  # compiled, or loaded
+    expected = pairs(sample)
+    for seed in range(4):
+        started = time.process_time()
+        out = made(sample, 200, 5, Source(seed, "tests").stream)
+        assert time.process_time() - started < 5.0
+        assert abs((out == OCCUPIED).mean() - (sample == OCCUPIED).mean()) <= SHARE
+        assert np.abs(np.array(pairs(out)) - expected).max() <= SHARE
+        assert windows(out, 5) <= windows(sample, 5)
+
+
+def test_what_is_fixed_stays() -> None:
+    sample = SAMPLES["pillars"].cells(0.1)
+    fixed = np.full((50, 50), -1)
+    fixed[10, 10:14] = 1
+    fixed[30:40, 30:40] = 0
+    out = made(sample, 50, 3, fixed=fixed)
+    assert (out[10, 10:14] == OCCUPIED).all()
+    assert (out[30:40, 30:40] == FREE).all()
+    assert windows(out, 3) <= windows(sample, 3)
+    fixed[20, 22:25] = 1, 0, 1
+    with pytest.raises(CannotGenerate, match=r"contradicts the sample at row (18|19|20), column 2[0-4]:"):
+        made(sample, 50, 3, fixed=fixed)
+
+
+def test_free_space_is_joined_where_that_is_asked() -> None:
+    def free_pieces(out: U8) -> int:
+        return int(cv2.connectedComponents((out == FREE).astype(np.uint8), connectivity=4)[0]) - 1
+
+    counts = []
+    for seed in range(3):
+        draw = Source(seed, "rooms").stream
+        counts.append(free_pieces(made(rooms(), 60, 3, draw)))
+        joined = made(rooms(), 60, 3, draw, joined=True)
+        assert free_pieces(joined) == 1
+        assert (joined == OCCUPIED).any()
+        assert windows(joined, 3) <= windows(rooms(), 3)
+    assert max(counts) > 1
+
+
+def test_a_sample_that_contradicts_itself_is_told() -> None:
+    made(board(), 4, 2)  # compiled, or loaded
+    started = time.process_time()
+    with pytest.raises(CannotGenerate, match="contradicts the sample"):
+        made(np.array([[0, 100], [100, 100]], np.uint8), 20, 2)
+    hard = (np.random.default_rng(2).integers(0, 2, (6, 6)) * OCCUPIED).astype(np.uint8)
+    with pytest.raises(CannotGenerate, match="11 contradictions could not be repaired in 4 attempts"):
+        made(hard, 30, 3, repairs=10, symmetry="all")
+    assert time.process_time() - started < 5.0
+
+
+def test_the_same_seed_gives_the_same_cells_everywhere() -> None:
+    out = made(SAMPLES["warehouse"].cells(0.1), 60, 4, Source(7, "hash").stream, joined=True)
+    free = made(rooms(), 40, 3, Source(7, "hash").stream, scan=False)
+    assert hashlib.sha256(out.tobytes() + free.tobytes()).hexdigest()[:16] == CELLS
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ({"width": 0}, "at least 0.5"),
+        ({"width": 1e9}, "at most 10000"),
+        ({"width": 10_000, "depth": 10_000}, "more than 67108864 cells"),
+        ({"width": 400, "depth": 400}, "tiles are more than 4194304"),
+        ({"sample": "nave"}, "give one of warehouse, office, pillars, or a grid"),
+        ({"model": "tiled", "pattern": 3}, "pattern: belongs to model=overlapping"),
+        ({"tile": 64, "width": 50, "depth": 50, "border": "open"}, "does not hold"),
+        ({"resolution": 0.0333}, "whole millimetres"),
+        ({"wrap": True}, "has no walls"),
+        ({"free": (1.0, 2.0, 3.0)}, "even number"),
+        ({"free": (99.0, 2.0)}, "outside"),
+        ({"free": (0.01, 2.0)}, "lies on a wall"),
+        ({"width": 0.5, "depth": 0.5, "tile": 4}, "too few"),
+        ({"pattern": 9}, "at most 8"),
+    ],
+)
+def test_what_cannot_be_made_is_told_before_work(values: dict[str, Any], why: str) -> None:
+    started = time.process_time()
+    with pytest.raises((CannotGenerate, Invalid), match=why):
+        looks.make(NAME, **values)
+    assert time.process_time() - started < 3.0
+
+
+def test_a_whole_site(tmp_path: Path) -> None:
+    site, notes = looks.make(NAME, width=8, depth=6, free=(4.0, 3.0), blocked=(2.0, 2.0))
+    looks.agrees_with_itself(site, 0.3)
+    grid = site.grids()[GRID]
+    assert (grid.width, grid.height, grid.resolution, grid.origin) == (160, 120, 0.05, (0.0, 0.0, 0.0))
+    assert grid.cells[60, 80] == FREE
+    assert grid.cells[40, 40] == OCCUPIED
+    rim = np.concatenate([grid.cells[0], grid.cells[-1], grid.cells[:, 0], grid.cells[:, -1]])
+    assert (rim == OCCUPIED).all()
+    kinds = {p["kind"] for part in site.vector("objects").values() for p in part.properties}
+    assert kinds == {"wall", "rack"}
+    assert not notes.warnings
+    looks.serves(site)
+    looks.sound_sdf(site, tmp_path)
+    assert looks.digest(site) == looks.digest(
+        looks.make(NAME, width=8, depth=6, free=(4.0, 3.0), blocked=(2.0, 2.0))[0]
+    )
+    assert looks.digest(site) != looks.digest(looks.make(NAME, seed=8, width=8, depth=6)[0])
+
+
+@pytest.mark.parametrize("border", ["open", "periodic"])
+def test_other_borders_and_tiles(border: str) -> None:
+    site, _ = looks.make(NAME, border=border, width=6, depth=6, model="tiled", order="entropy", symmetry="mirror")
+    looks.agrees_with_itself(site, 0.3)
+
+
+def test_a_grid_of_the_environment_as_sample_inside_its_fence() -> None:
+    first, _ = looks.make(NAME, width=6, depth=6)
+    plan = {GRID: first.grids()[GRID], **{k: p for k, p in first.parts.items() if k.layer == "location"}}
+    site, _ = looks.make(NAME, given=Layers(plan, first.datum), sample="map", pattern=3, symmetry="all")
+    looks.agrees_with_itself(Layers({**plan, **site.parts}, site.datum), 0.3)
+    assert site.grids()[GRID].cells.shape == first.grids()[GRID].cells.shape
+    with pytest.raises(CannotGenerate, match=r"is the sample's, 0\.05 m"):
+        looks.make(NAME, given=Layers(plan, first.datum), sample="map", resolution=0.1)
+
+
+def holed() -> tuple[U8, U8]:
+    """A place, and the same with an unknown hole."""
+    whole = made(SAMPLES["warehouse"].cells(0.05), 120, 4)
+    cells = whole.copy()
+    cells[40:70, 50:90] = UNKNOWN
+    cells[5, 5] = 42
+    return whole, cells
+
+
+def completed(cells: U8, seed: int = 7, **values: Any) -> tuple[U8, Notes]:
+    notes = Notes()
+    given = Layers({GRID: OccupancyGrid(cells, 0.05, properties={"kept": 1})})
+    out = generate.run("complete_grid", seed, values, given, notes).grids()[GRID]
+    assert out.properties == {"kept": 1}
+    return out.cells, notes
+
+
+@pytest.mark.parametrize("order", ["rows", "entropy"])
+def test_an_unknown_part_is_made_of_what_is_known(order: str) -> None:
+    whole, cells = holed()
+    out, notes = completed(cells, reach=0, order=order, symmetry="none")
+    assert (out == cells)[cells != UNKNOWN].all()
+    assert set(np.unique(out[cells == UNKNOWN])) <= {FREE, OCCUPIED}
+    plain = np.where(out >= 65, OCCUPIED, FREE).astype(np.uint8)
+    strange = windows(plain[37:73, 47:93], 3) - windows(whole, 3)
+    assert len(strange) <= sum("stand nowhere" in w.problem for w in notes.warnings) * 40
+    near, _ = completed(cells, reach=0.25, order=order)
+    filled = (near != UNKNOWN) & (cells == UNKNOWN)
+    assert 0 < filled.sum() < (cells == UNKNOWN).sum()
+    assert not filled[46:64, 56:84].any(), "what is farther than the reach stays unknown"
+
+
+def test_completing_is_the_same_everywhere() -> None:
+    cells = np.full((20, 20), UNKNOWN, np.uint8)
+    cells[:8] = board()[0, 0]
+    cells[3:5, 4:16] = OCCUPIED
+    out, _ = completed(cells, reach=0.3)
+    assert hashlib.sha256(out.tobytes()).hexdigest()[:16] == COMPLETED
+    assert out.tobytes() == completed(cells, reach=0.3)[0].tobytes()
+
+
+def test_known_cells_that_fit_no_pattern_are_gone_around(shared: Path) -> None:
+    with Image.open(shared / "data" / "occupancy_grid" / "nav2_tb3_sandbox" / "tb3_sandbox.pgm") as picture:
+        grey = np.asarray(picture.convert("L"))[::-1]
+    cells = np.where(grey < 90, OCCUPIED, np.where(grey > 220, FREE, UNKNOWN)).astype(np.uint8)
+    out, notes = completed(cells, reach=0.4)
+    assert (out == cells)[cells != UNKNOWN].all()
+    assert (out == UNKNOWN).sum() < (cells == UNKNOWN).sum()
+    assert all("stand nowhere in the known part" in w.problem for w in notes.warnings)
+
+
+@pytest.mark.parametrize(
+    ("cells", "values", "why"),
+    [
+        (np.zeros((9, 9), np.uint8), {}, "has no unknown cell"),
+        (np.full((9, 9), UNKNOWN, np.uint8), {}, "no window of 3 × 3 cells is known"),
+        (np.array([[0, 255], [255, 255]], np.uint8), {"pattern": 2}, "no window of 2 × 2"),
+        (np.full((1100, 1100), UNKNOWN, np.uint8), {"reach": 0}, "1210000 cells would be filled in"),
+        (np.pad(np.zeros((5, 5), np.uint8), 9, constant_values=UNKNOWN), {"reach": 0.01}, "give a larger reach"),
+        (np.zeros((9, 9), np.uint8), {"pattern": 4}, "at most 3"),
+    ],
+)
+def test_what_cannot_be_completed_is_told(cells: U8, values: dict[str, Any], why: str) -> None:
+    with pytest.raises((CannotGenerate, Invalid), match=why):
+        completed(cells, **values)
+
+
+def test_without_a_grid_there_is_nothing_to_complete() -> None:
+    with pytest.raises(MissingLayer, match="complete_grid works on occupancy"):
+        generate.run("complete_grid", 7, {}, Layers(), Notes())
+
+
+def test_over_http(api: Api) -> None:
+    version = looks.over_http(api, NAME, ("occupancy_grid", "tmap2", "gazebo"), width=6, depth=6)
+    assert version["information"] | {"occupancy": "generated", "topology": "generated"} == version["information"]
+    env = f"environments/made-{NAME}/generations"
+    told = api.problem("POST", env, 422, json={"generator": NAME, "seed": 1, "parameters": {"width": 0}})
+    assert "width" in told["detail"]
+    told = api.problem("POST", env, 422, json={"generator": "complete_grid", "seed": 1, "parameters": {}})
+    assert "no unknown cell" in told["detail"]
+
+
+def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "map.zip"
+    status = run(
+        ["generate", NAME, "--seed", "7", "--to", "occupancy_grid", "-o", str(out), "-O", "width=4", "-O", "depth=4"]
+    )
+    assert status == 0, capsys.readouterr().err
+    assert out.stat().st_size > 100
