@@ -1,0 +1,422 @@
+"""A grammar for towns: from a boundary to streets, blocks, lots and buildings, by rules that are data.
+
+Rules are text, one a line (or between semicolons), ``#`` begins a comment::
+
+    town -> ring(main) quarter                       # the first rule's shape is what the boundary is
+    quarter : area > block -> cut(rand(0.4, 0.6), street) quarter quarter
+    quarter : area <= block -> lots
+    lots : area > 600 -> cut(0.5, 0) lots lots       # of the rules that hold one is taken, by weight
+    lots : area <= 600 @ 3 -> inset(2) house
+    lots : area <= 600 @ 1 -> garden
+    house -> gable(rand(1, 3))
+
+Left of the arrow: a shape's name, a condition, a weight. Right of it one action and the names of the shapes that it
+makes. Expressions (``_expressions``) know the shape's ``area`` (m²), the ``length`` and ``width`` of the rectangle
+around it, its ``frontage`` (metres of its edge on a street), how ``deep`` it is in the rules, and constants.
+
+========================== ============================================================================================
+``ring(street) A``          a street along the inside of the shape's edge; A is what it encloses
+``cut(share, street) A B``  in two, across the longer side, at this share of it; a street of this width between, or none
+``inset(metres) A``         A is what lies farther from the edge
+``flat(storeys)``           a building with this roof; ``gable`` and ``hip`` stand on the largest rectangle that fits
+``gable(…)``, ``hip(…)``
+``garden``, ``park``,       open ground, planted or paved; also where a rule leads to nothing else
+``square``
+========================== ============================================================================================
+
+In the spirit of Wonka et al., Instant Architecture (2003), and Parish and Müller, Procedural Modeling of Cities (2001):
+lots are halved along the rectangle around them. What makes more shapes, or goes deeper, than is allowed is stopped.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.errors import CannotGenerate, Problem
+from app.generate import _expressions
+from app.generate._expressions import Expression, refuse
+
+MOST_SHAPES = 10_000
+DEEPEST = 48
+MOST_TEXT, MOST_RULES = 20_000, 200
+SMALLEST = 1.0
+"""Square metres: smaller pieces are left as they are."""
+
+NEAR = 14.0
+"""Metres: a street ends at a crossing that is nearer than this, or farther from it."""
+
+SHAPE_NAMES = frozenset({"area", "length", "width", "frontage", "deep"})
+ROOFS = ("flat", "gable", "hip")
+OPEN = ("garden", "park", "square")
+ACTIONS: Mapping[str, tuple[int, int]] = {
+    "ring": (1, 1),
+    "cut": (2, 2),
+    "inset": (1, 1),
+    **dict.fromkeys(ROOFS, (1, 0)),
+}
+"""How many values and how many shapes each action takes."""
+
+_RULE = re.compile(r"\s*([a-z_][a-z0-9_]*)\s*(?::(.*))?", re.DOTALL)
+_ACTION = re.compile(r"\s*([a-z_][a-z0-9_]*)\s*(\(.*\))?([a-z0-9_\s]*)", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One way on for a shape."""
+
+    condition: Expression | None
+    weight: Expression | None
+    action: str
+    values: tuple[Expression, ...]
+    makes: tuple[str, ...]
+    where: str
+
+
+@dataclass(frozen=True, slots=True)
+class Grammar:
+    """Checked rules by shape. start: what the boundary is."""
+
+    start: str
+    rules: Mapping[str, tuple[Rule, ...]]
+    constants: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Street:
+    """A street's middle line and its width, houses to houses; metres."""
+
+    line: Any
+    width: float
+
+
+@dataclass(frozen=True, slots=True)
+class Lot:
+    """Ground that the rules end at. use: flat, gable or hip with storeys, or one of OPEN."""
+
+    area: Any
+    use: str
+    storeys: int = 0
+
+
+@dataclass(slots=True)
+class Town:
+    """What the rules make. blocks: the ground between streets. ends: of the streets."""
+
+    streets: list[Street] = field(default_factory=list)
+    blocks: list[Any] = field(default_factory=list)
+    lots: list[Lot] = field(default_factory=list)
+    ends: list[tuple[float, float]] = field(default_factory=list)
+
+    def street(self, line: Any, width: float) -> None:
+        """One more street."""
+        self.streets.append(Street(line, width))
+        self.ends += [(float(x), float(y)) for x, y in shapely.get_coordinates(line)[[0, -1]]]
+
+
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """whole: reaches to the middle of the streets around it; land: without them; front: a strip along the edge of its
+    block, once that has been cut into lots."""
+
+    name: str
+    whole: Any
+    land: Any
+    front: Any
+    deep: int
+
+
+# --- rules ------------------------------------------------------------------------------------------------------------
+
+
+def parse(text: str, constants: Mapping[str, float]) -> Grammar:
+    """The grammar that these rules describe. Invalid names the rule and what is wrong with it."""
+    if len(text) > MOST_TEXT:
+        refuse(f"the rules have {len(text)} characters; the limit is {MOST_TEXT}", "rules")
+    statements = [s.strip() for line in text.splitlines() for s in line.partition("#")[0].split(";")]
+    statements = [s for s in statements if s]
+    if not 0 < len(statements) <= MOST_RULES:
+        refuse(f"there are {len(statements)} rules; there must be 1 to {MOST_RULES}", "rules")
+    known = frozenset({*SHAPE_NAMES, *constants})
+    rules: dict[str, list[Rule]] = {}
+    for k, said in enumerate(statements):
+        where = f"rules, rule {k + 1}"
+        head, arrow, tail = said.partition("->")
+        head, at, weight = head.partition("@")
+        found = _RULE.fullmatch(head)
+        if not arrow or found is None:
+            refuse(f"{said[:60]!r} is no rule, such as lots : area > 600 @ 2 -> cut(0.5, 0) lots lots", where)
+        if found[2] is not None and not found[2].strip():
+            refuse("a condition is missing behind :", where)
+        rule = _action(tail, known, where)
+        rules.setdefault(found[1], []).append(
+            Rule(
+                _expressions.parse(found[2], known, where) if found[2] else None,
+                _expressions.parse(weight, known, where) if at else None,
+                *rule,
+                where,
+            )
+        )
+    grammar = Grammar(next(iter(rules)), {name: tuple(found) for name, found in rules.items()}, dict(constants))
+    for found_ in grammar.rules.values():
+        for rule_ in found_:
+            for name in rule_.makes:
+                if name not in grammar.rules and name not in OPEN:
+                    refuse(f"no rule says what becomes of {name!r}", rule_.where)
+    return grammar
+
+
+def _action(text: str, known: frozenset[str], where: str) -> tuple[str, tuple[Expression, ...], tuple[str, ...]]:
+    found = _ACTION.fullmatch(text)
+    if found is None:
+        refuse(f"{text.strip()[:60]!r} is no action with the shapes it makes, such as cut(0.5, 8) a b", where)
+    name, inside, rest = found[1], found[2], tuple(found[3].split())
+    if name not in ACTIONS:
+        if inside is None and not rest:
+            return "is", (), (name,)
+        refuse(f"there is no action {name!r}; there are {', '.join(ACTIONS)}, or a shape's name alone", where)
+    values = tuple(_expressions.parse(one, known, where) for one in _split(inside or "()"))
+    wants, makes = ACTIONS[name]
+    if len(values) != wants or len(rest) != makes:
+        refuse(f"{name} takes {wants} values and makes {makes} shapes, got {len(values)} and {len(rest)}", where)
+    return name, values, rest
+
+
+def _split(inside: str) -> list[str]:
+    """What stands between parentheses, cut at its outer commas."""
+    out, deep, start = [], 0, 1
+    for k, sign in enumerate(inside):
+        deep += (sign == "(") - (sign == ")")
+        if sign == "," and deep == 1:
+            out.append(inside[start:k])
+            start = k + 1
+    out.append(inside[start:-1])
+    return out
+
+
+# --- what they make ---------------------------------------------------------------------------------------------------
+
+
+def grow(grammar: Grammar, boundary: Any, chance: np.random.Generator) -> Town:
+    """The town that the rules make of a boundary (a polygon, metres).
+
+    CannotGenerate where they make too many shapes, go too deep, or ask for what cannot be.
+    """
+    town = Town()
+    waiting = [_Shape(grammar.start, boundary, boundary, None, 0)]
+    made = 0
+    while waiting:
+        shape = waiting.pop()
+        made += 1
+        if made > MOST_SHAPES:
+            _stop(f"the rules make more than {MOST_SHAPES} shapes", "rules")
+        rules = grammar.rules.get(shape.name)
+        if rules is None or shape.land.area < SMALLEST:
+            _end(town, shape, shape.name if shape.name in OPEN else "garden")
+            continue
+        names = _Measures(grammar.constants, shape)
+        rule = _chosen(rules, names, chance)
+        if rule is None:
+            _end(town, shape, "garden")
+            continue
+        if shape.deep >= DEEPEST:
+            _stop(f"the rules go more than {DEEPEST} deep: give {shape.name!r} an end", rule.where)
+        # The last one waits first, so that shapes are made from the first to the last.
+        waiting += reversed(_applied(town, shape, rule, [value(names, chance) for value in rule.values]))
+    return town
+
+
+def _stop(what: str, where: str) -> None:
+    raise CannotGenerate(f"{where}: {what}", [Problem(what, where=where)])
+
+
+def _end(town: Town, shape: _Shape, use: str, storeys: int = 0) -> None:
+    if shape.front is None and not shape.land.is_empty:
+        town.blocks.append(shape.land)
+    if shape.land.area > 0:
+        town.lots.append(Lot(shape.land, use, storeys))
+
+
+class _Measures(dict[str, float]):
+    """What expressions know of a shape: constants, and its measures once they are asked for."""
+
+    def __init__(self, constants: Mapping[str, float], shape: _Shape) -> None:
+        super().__init__(constants)
+        self.shape = shape
+
+    def __missing__(self, name: str) -> float:
+        shape = self.shape
+        if name == "area":
+            self[name] = round(shape.land.area, 3)
+        elif name == "deep":
+            self[name] = float(shape.deep)
+        elif name == "frontage":
+            edge = shapely.boundary(shape.land)
+            part = edge if shape.front is None else shapely.intersection(edge, shape.front)
+            self[name] = round(part.length, 2)
+        else:
+            long, short = _box(shape.land)[2:]
+            self["length"], self["width"] = round(long, 3), round(short, 3)
+        return self[name]
+
+
+def _strip(land: Any) -> Any:
+    """What lies within a centimetre of a block's edge."""
+    return shapely.buffer(shapely.boundary(land), 0.01, cap_style="flat", join_style="mitre")
+
+
+def _chosen(rules: Sequence[Rule], names: Mapping[str, float], chance: np.random.Generator) -> Rule | None:
+    holding = [r for r in rules if r.condition is None or r.condition(names, chance) != 0]
+    if len(holding) < 2:
+        return holding[0] if holding else None
+    weights = [1.0 if r.weight is None else r.weight(names, chance) for r in holding]
+    if min(weights) < 0 or not sum(weights) > 0:
+        _stop("weights must not be negative, and one must be above 0", holding[0].where)
+    left = float(chance.random()) * sum(weights)
+    for rule, weight in zip(holding, weights, strict=True):
+        left -= weight
+        if left < 0:
+            return rule
+    return holding[-1]
+
+
+def _applied(town: Town, shape: _Shape, rule: Rule, values: list[float]) -> list[_Shape]:
+    """The shapes that an action makes; buildings and open ground are done with."""
+    deep = shape.deep + 1
+    if rule.action == "is":
+        return [_Shape(rule.makes[0], shape.whole, shape.land, shape.front, deep)]
+    if rule.action in ROOFS:
+        storeys = math.floor(values[0] + 0.5)
+        if not 1 <= storeys <= 100:
+            _stop(f"a building has 1 to 100 storeys, got {values[0]:g}", rule.where)
+        _end(town, shape, rule.action, storeys)
+        return []
+    if rule.action == "inset":
+        return _inset(town, shape, rule, values[0], deep)
+    width = values[-1]
+    if width != 0 and not 1.0 <= width <= 200.0:
+        _stop(f"a street is 1 to 200 m wide, or 0 for none, got {width:g}", rule.where)
+    if width and shape.front is not None:
+        _stop("a street cannot lead through what has been cut into lots", rule.where)
+    if rule.action == "ring":
+        return _ring(town, shape, rule, width, deep)
+    if not 0.02 <= values[0] <= 0.98:
+        _stop(f"a share is from 0.02 to 0.98, got {values[0]:g}", rule.where)
+    return _cut(town, shape, rule, values[0], width, deep)
+
+
+def _inset(town: Town, shape: _Shape, rule: Rule, metres: float, deep: int) -> list[_Shape]:
+    if metres < 0:
+        _stop(f"an inset is not negative, got {metres:g}", rule.where)
+    front = shape.front
+    if front is None:
+        town.blocks.append(shape.land)
+        front = _strip(shape.land)
+    inner = _pieces(shapely.buffer(shape.land, -metres, join_style="mitre"))
+    if not inner:
+        _end(town, _Shape(shape.name, shape.land, shape.land, front, deep), "garden")
+    return [_Shape(rule.makes[0], piece, piece, front, deep) for piece in inner]
+
+
+def _ring(town: Town, shape: _Shape, rule: Rule, width: float, deep: int) -> list[_Shape]:
+    if width == 0:
+        _stop("a ring needs a street's width", rule.where)
+    middle = _pieces(shapely.buffer(shape.land, -width / 2, join_style="mitre"))
+    out = []
+    for whole in middle:
+        land = _pieces(shapely.buffer(whole, -width / 2, join_style="mitre"))
+        if not land:
+            continue
+        town.street(shapely.LineString(shapely.get_coordinates(whole.exterior)), width)
+        out += [_Shape(rule.makes[0], whole, piece, None, deep) for piece in land]
+    if not out:
+        _stop(f"there is no room for a ring of {width:g} m and anything in it", rule.where)
+    return out
+
+
+def _cut(town: Town, shape: _Shape, rule: Rule, share: float, width: float, deep: int) -> list[_Shape]:
+    """In two halves, each of which may be several pieces."""
+    (x, y), along, long, short = _box(shape.land)
+    if width:
+        share = _aligned(town, shape.land, share, width)
+    reach = long + short + 1000.0
+    middle = (x + along[0] * (share - 0.5) * long, y + along[1] * (share - 0.5) * long)
+    across = (-along[1], along[0])
+    ends = [(middle[0] + s * across[0] * reach, middle[1] + s * across[1] * reach) for s in (-1, 1)]
+    far = [(px + s * along[0] * reach, py + s * along[1] * reach) for s in (-1, 1) for px, py in ends]
+    sides = [shapely.Polygon([*ends, far[1], far[0]]), shapely.Polygon([*ends, far[3], far[2]])]
+    line = shapely.LineString(ends)
+    front = shape.front
+    if width:
+        for part in shapely.get_parts(shapely.intersection(line, shape.whole)):
+            if part.geom_type == "LineString" and part.length > 0.5:
+                town.street(_mm(part), width)
+    elif front is None:
+        town.blocks.append(shape.land)
+        front = _strip(shape.land)
+    strip = shapely.buffer(line, width / 2, cap_style="flat") if width else None
+    out = []
+    for side, name in zip(sides, rule.makes, strict=True):
+        if strip is None:
+            out += [_Shape(name, p, p, front, deep) for p in _pieces(shapely.intersection(shape.land, side))]
+            continue
+        for whole in _pieces(shapely.intersection(shape.whole, side)):
+            land = shapely.intersection(shape.land, whole)
+            land = shapely.difference(land, strip)
+            out += [_Shape(name, whole, piece, front, deep) for piece in _pieces(land)]
+    return out
+
+
+def _aligned(town: Town, land: Any, share: float, width: float) -> float:
+    """A share at which a street meets those that end nearby, or keeps away from them."""
+    (x, y), along, long, short = _box(land)
+    near = []
+    for px, py in town.ends:
+        u = (px - x) * along[0] + (py - y) * along[1]
+        v = abs(-(px - x) * along[1] + (py - y) * along[0])
+        if abs(u) < 0.45 * long and v < short / 2 + 2 * width + 2.0:
+            near.append(u)
+    if not near:
+        return share
+    at = (share - 0.5) * long
+    nearest = min(near, key=lambda u: (abs(u - at), u))
+    if abs(nearest - at) >= NEAR + width / 2:
+        return share
+    moved = nearest / long + 0.5
+    return moved if 0.2 <= moved <= 0.8 else share
+
+
+def _box(area: Any) -> tuple[tuple[float, float], tuple[float, float], float, float]:
+    """Middle, direction of the longer side, length and width of the rectangle around an area."""
+    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area))
+    if len(corners) < 4:
+        return (0.0, 0.0), (1.0, 0.0), 0.0, 0.0
+    a, b = corners[1] - corners[0], corners[2] - corners[1]
+    la, lb = math.sqrt(float(a @ a)), math.sqrt(float(b @ b))
+    long = a / la if la >= lb else b / lb
+    if long[0] < -1e-9 or (abs(long[0]) <= 1e-9 and long[1] < 0):
+        long = -long
+    middle = (corners[0] + corners[2]) / 2
+    along = (round(float(long[0]), 9), round(float(long[1]), 9))
+    return (float(middle[0]), float(middle[1])), along, max(la, lb), min(la, lb)
+
+
+def _mm(geometry: Any) -> Any:
+    return shapely.transform(geometry, lambda xy: np.round(xy, 3) + 0.0)
+
+
+def _pieces(area: Any) -> list[Any]:
+    """The polygons of an area in whole millimetres, from the left and from below; slivers and holes are left out."""
+    out = []
+    for part in shapely.get_parts(area):
+        if part.geom_type != "Polygon" or part.area < SMALLEST:
+            continue
+        plain = shapely.make_valid(_mm(shapely.Polygon(part.exterior)))
+        out += [p for p in shapely.get_parts(plain) if p.geom_type == "Polygon" and p.area >= SMALLEST]
+    return sorted((shapely.normalize(p) for p in out), key=lambda p: p.bounds)

@@ -1,0 +1,223 @@
+"""Towns by a grammar: rules, streets and lanes, buildings, and what cannot be made."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from app.convert import written
+from app.errors import CannotGenerate, Invalid
+from app.generate import Source, _blocks, _streets
+from app.model.features import features
+from app.model.frame import GROUND, Datum
+from app.model.layers import Layers, PartKey
+from tests.api.conftest import Api
+from tests.generate import looks
+
+DIGEST = "1d0db5670c2b14c87a8b20aab0c9fcdf18a0b94bd3d032d0aaa33f9ec2f48d18"
+SQUARE = shapely.box(0, 0, 100, 60)
+
+
+def grown(rules: str, area: Any = SQUARE, seed: int = 7, **constants: float) -> _blocks.Town:
+    return _blocks.grow(_blocks.parse(rules, constants), area, Source(seed, "town").stream("rules"))
+
+
+def test_a_town_agrees_with_itself_and_every_format_serves_from_it(tmp_path: Path) -> None:
+    made, _ = looks.make("town", width=110, depth=80, block=2500, resolution=0.2)
+    looks.agrees_with_itself(made, 0.3)
+    looks.sound_sdf(made, tmp_path)
+    looks.serves(made)
+    assert looks.digest(made) == DIGEST
+
+
+def test_rules_worked_out_by_hand() -> None:
+    """100 × 60 m with a ring of 10 m: 80 × 40 m in it, cut in the middle by a street of 6 m: two blocks of 37 × 40."""
+    made = grown(
+        """
+        town -> ring(ring) inner      # a comment
+        inner -> cut(0.5, 6) block block
+        block : area > 1000 -> cut(0.25, 0) lot lot
+        lot : length > 28 & width >= 28 -> inset(3) house
+        lot : length <= 28 | width < 28 -> garden
+        house -> flat(2)
+        """,
+        ring=10,
+    )
+    assert [s.width for s in made.streets] == [10, 6]
+    assert made.streets[0].line.length == 2 * (90 + 50)
+    assert made.streets[1].line.equals(shapely.LineString([(50, 5), (50, 55)]))
+    assert [b.area for b in made.blocks] == [37 * 40, 37 * 40]
+    assert [(round(lot.area.area, 3), lot.use, lot.storeys) for lot in made.lots] == [
+        (370, "garden", 0),
+        (31 * 24, "flat", 2),
+        (370, "garden", 0),
+        (31 * 24, "flat", 2),
+    ]
+
+
+def test_frontage_is_the_edge_on_a_street() -> None:
+    """Three lots in a row of 60 × 20 m: the middle one has 2 × 20 m of street, the others 20 + 2 × 20 m."""
+    row = shapely.box(0, 0, 60, 20)
+    rules = "a -> cut(0.3333333333, 0) end b; b -> cut(0.5, 0) mid end; mid : frontage > 39 & frontage < 41 -> flat(1)"
+    made = grown(rules + "; end : frontage > 59 & frontage < 61 -> gable(1)", row)
+    assert Counter(lot.use for lot in made.lots) == {"flat": 1, "gable": 2}
+
+
+def test_chance_by_weights_and_seed() -> None:
+    rules = "a : area > 4 -> cut(0.5, 0) a a; a : area <= 4 @ 3 -> flat(1); a : area <= 4 @ 1 -> park; x -> a"
+    made = grown(rules, shapely.box(0, 0, 40, 40))
+    uses = Counter(lot.use for lot in made.lots)
+    assert 0.66 < uses["flat"] / sum(uses.values()) < 0.84
+    assert [lot.use for lot in made.lots] == [lot.use for lot in grown(rules, shapely.box(0, 0, 40, 40)).lots]
+    assert [lot.use for lot in made.lots] != [lot.use for lot in grown(rules, shapely.box(0, 0, 40, 40), 8).lots]
+
+
+@pytest.mark.parametrize(
+    ("rules", "why"),
+    [
+        ("", "there are 0 rules"),
+        ("town", "is no rule"),
+        ("town -> explode(3) a", "no action 'explode'"),
+        ("town -> house", "no rule says what becomes of 'house'"),
+        ("town -> ring(5)", "takes 1 values and makes 1 shapes"),
+        ("town -> cut(0.5) a b", "takes 2 values"),
+        ("town -> ring(__import__) town", "nothing is called"),
+        ("town : -> park", "a condition is missing"),
+        ("town -> park extra", "no action 'park'"),
+        ("T O W N -> park", "is no rule"),
+        ("town -> park\n" * 201, "1 to 200"),
+    ],
+)
+def test_rules_that_cannot_be_read(rules: str, why: str) -> None:
+    with pytest.raises(Invalid, match=why):
+        _blocks.parse(rules, {})
+
+
+@pytest.mark.parametrize(
+    ("rules", "why"),
+    [
+        ("a -> a", "more than 48 deep"),
+        ("a -> inset(0) a", "more than 48 deep"),
+        ("a -> ring(90) a", "no room for a ring of 90 m"),
+        ("a -> cut(5, 0) a a", "a share is from"),
+        ("a -> cut(0.5, 900) a a", "1 to 200 m wide"),
+        ("a -> inset(0 - 1) a", "not negative"),
+        ("a -> flat(0)", "1 to 100 storeys"),
+        ("a -> cut(0.5, 0) b b; b -> cut(0.5, 6) b b", "what has been cut into lots"),
+        ("a -> cut(1 / 0, 6) a a", "cannot be computed"),
+        ("a @ 0 -> park; a @ 0 -> garden", "weights"),
+    ],
+)
+def test_rules_that_lead_nowhere(rules: str, why: str) -> None:
+    with pytest.raises(CannotGenerate, match=why):
+        grown(rules)
+
+
+def test_a_grammar_that_explodes_is_stopped() -> None:
+    with pytest.raises(CannotGenerate, match="the rules make more than 10000 shapes"):
+        grown("a -> cut(0.5, 0) a a", shapely.box(0, 0, 3000, 3000))
+
+
+def test_streets_that_cross_and_end_make_lanes_to_the_right() -> None:
+    """A cross of two streets of 12 m: four links, four lanes in, four out, and no lane turns round at the middle."""
+    lines = [shapely.LineString([(0, 50), (100, 50)]), shapely.LineString([(50, 0), (50, 100)])]
+    streets = _streets.network_of([_blocks.Street(line, 12.0) for line in lines], 2.0)
+    assert len(streets.links) == 4
+    assert sorted(streets.junctions)[2] == (50, 50)
+    assert (streets.walk, streets.carriage(streets.links[0])) == (2.0, 8.0)
+    middle = streets.junctions.index((50, 50))
+    assert len(streets.around(middle)) == 4
+    end = streets.junctions.index((0, 50))
+    lane = _streets._lane(streets, shapely.LineString([(0, 50), (50, 50)]), end, middle, 2)
+    at = shapely.get_coordinates(lane)
+    assert at.tolist() == [[3, 48], [41.5, 48]], "on the right, 4 + 2 + 0.5 + 2 m before the junction"
+
+
+def test_lanes_sidewalks_and_crossings_of_a_town() -> None:
+    made, notes = looks.make("town", width=160, depth=120, trees=False, resolution=0.2)
+    network = made.vector("topology")[PartKey("topology", GROUND, "network")]
+    edges = [p for p in network.properties if p["kind"] == "edge"]
+    ways = {(p["source"], p["target"]) for p in edges}
+    lanes = [p for p in edges if p["speed_limit"] == 5.0]
+    assert len(lanes) >= 8
+    assert not any((p["target"], p["source"]) in ways for p in lanes), "lanes are one-way"
+    walks = [p for p in edges if p.get("surface") == "paving_stones"]
+    assert all((p["target"], p["source"]) in ways for p in walks), "sidewalks are not"
+    assert sum(p["action"] == "cross" for p in edges) >= 8
+    assert not any(d["what"] == "sidewalks" for d in notes.dropped)
+    objects = made.vector("objects")[PartKey("objects", GROUND, "generated")]
+    roads = objects.of_kind("road")
+    buildings = objects.of_kind("building")
+    for road, p in zip(roads.geometry, roads.properties, strict=True):
+        assert not shapely.intersects(shapely.buffer(road, p["width"] / 2), buildings.geometry).any()
+    area = shapely.union_all(buildings.geometry).area
+    assert area == pytest.approx(shapely.area(buildings.geometry).sum()), "no two buildings overlap"
+    for p in buildings.properties:
+        assert p["height"] >= p["levels"] * 2.9
+        assert p["osm"]["tags"]["building:levels"] == str(p["levels"])
+    lamps = objects.of_kind("pole")
+    assert len(lamps) > 5
+    assert b'k="roof:shape"' in written(made, "osm", {}, looks.CAME).files["map.osm"]
+
+
+def test_the_boundary_is_given_or_the_fence() -> None:
+    ring = shapely.Polygon([(0, 0), (120, 20), (100, 110), (10, 90)])
+    said = ",".join(f"{v:g}" for point in ring.exterior.coords[:-1] for v in point)
+    made, _ = looks.make("town", boundary=said, resolution=0.2)
+    looks.agrees_with_itself(made, 0.3)
+    buildings = made.vector("objects")[PartKey("objects", GROUND, "generated")].of_kind("building")
+    assert len(buildings) > 4
+    assert shapely.contains(ring, buildings.geometry).all()
+    fence = features([("f", ring, {"kind": "fence"})], "local")
+    given = Layers({PartKey("location", GROUND, "site"): fence}, Datum(53.0, -0.5))
+    made, _ = looks.make("town", given=given, resolution=0.2)
+    for part in (*made.vector("objects").values(), *made.vector("topology").values()):
+        assert shapely.contains(shapely.buffer(ring, 1e-6), part.geometry).all()
+    with pytest.raises(CannotGenerate, match="boundary: reaches beyond the fence"):
+        looks.make("town", given=given, boundary="0,0,500,0,500,500")
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        ({"boundary": "0,0,10,0"}, "3 to 1000 corners"),
+        ({"boundary": "0,0,10,0,20,0"}, "no polygon|area of 0"),
+        ({"boundary": "0,0,10,10,10,0,0,10"}, "is no polygon: Self-intersection"),
+        ({"boundary": "0,0,1,0,1,1"}, r"an area of 0\.5 m²"),
+        ({"boundary": "0,0,1e9,0,1e9,1e9"}, "within a million metres"),
+        ({"boundary": "0,0,9e5,0,9e5,9e5"}, "km² are more than 25"),
+        ({"boundary": "a,b"}, "must be a number"),
+        ({"width": 0}, "at least 30"),
+        ({"width": 1e9}, "at most 5000"),
+        ({"width": 5000, "depth": 5000, "resolution": 0.1}, "coarser resolution"),
+        ({"rules": "town -> park"}, "the rules make no street"),
+        ({"rules": "town -> nothing"}, "no rule says what becomes of 'nothing'"),
+        ({"sidewalk": 1, "robot_radius": 0.6}, "too narrow for the robot"),
+        ({"main": 100, "width": 60, "depth": 60}, "no room for a ring of 100 m"),
+    ],
+)
+def test_what_cannot_be_made_is_told(values: dict[str, Any], why: str) -> None:
+    with pytest.raises((CannotGenerate, Invalid), match=why):
+        looks.make("town", **values)
+
+
+def test_rules_of_ones_own_may_leave_streets_open() -> None:
+    rules = "town -> cut(0.5, street) half half; half -> cut(0.5, street) use use; use -> inset(setback) house"
+    rules += "; house -> hip(2)"
+    made, _ = looks.make("town", width=80, depth=60, rules=rules, resolution=0.1)
+    looks.agrees_with_itself(made, 0.3)
+    objects = made.vector("objects")[PartKey("objects", GROUND, "generated")]
+    assert Counter(p["kind"] for p in objects.properties)["building"] == 4
+    assert {p["roof"] for p in objects.of_kind("building").properties} == {"hip"}
+    assert np.isfinite(shapely.bounds(objects.geometry)).all()
+
+
+def test_over_http(api: Api) -> None:
+    wanted = ("osm", "gazebo", "tmap2", "geojson", "occupancy_grid")
+    version = looks.over_http(api, "town", wanted, width=70, depth=60, trees=False, resolution=0.2)
+    assert version["information"]["objects"] == "generated"
