@@ -19,7 +19,7 @@ import shapely
 from app.errors import CannotGenerate
 from app.generate import Source
 from app.generate._place import Place, placed
-from app.generate._site import Site, angle, mm, refused
+from app.generate._site import SLACK, Site, angle, mm, refused
 from app.model.frame import GROUND, Level
 
 FAMILY = "openrmf"
@@ -358,7 +358,7 @@ def check(measures: Storeys, radius: float) -> None:
 
 def fits_robot(site: Site, measures: Storeys, radius: float) -> None:
     """Whether a robot passes the doors, once the grid's resolution is known."""
-    need = 2 * radius + 6 * site.resolution
+    need = 2 * radius + 2 * SLACK * site.resolution
     widths = {"door_width": measures.door, "corridor": measures.corridor - ENTRANCE}
     if measures.lift:
         widths["robot_radius"] = LIFT_DOOR
@@ -392,7 +392,8 @@ def build(
     """
     west = SHAFT if measures.lift else 0.0
     total, across = west + measures.length, 2 * measures.depth + measures.corridor
-    place = placed(site, total + APRON, across, MARGIN)
+    narrow = min(measures.door, measures.corridor - ENTRANCE, *([LIFT_DOOR] if measures.lift else []))
+    place = placed(site, total + APRON, across, MARGIN, narrow / 2 - radius)
     fits_robot(site, measures, radius)
     building = Building(site, place, measures, radius)
     names = names_of(measures.levels)

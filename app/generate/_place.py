@@ -39,18 +39,18 @@ class Place:
         return shapely.transform(geometry, moved)
 
 
-def placed(site: Site, width: float, depth: float, margin: float) -> Place:
+def placed(site: Site, width: float, depth: float, margin: float, room: float = math.inf) -> Place:
     """Bound the site to a rectangle of this size and a margin around it, or put it into the fence that is given.
 
-    The drawn rectangle reaches from (0, 0) to (width, depth). In a given fence it lies along the fence's longer side
-    where it fits, else along the axes. CannotGenerate where the fence has no room for it.
+    room: metres beside a robot at the narrowest (``Site.bounded``). The drawn rectangle reaches from (0, 0) to (width,
+    depth). In a given fence it lies along the fence's longer side where it fits, else across it or along the axes.
+    CannotGenerate where the fence has no room for it.
     """
     whole = shapely.box(-margin, -margin, width + margin, depth + margin)
-    fence = site.bounded(whole)
+    fence = site.bounded(whole, room=room)
     if not site.is_given:
         return Place()
-    inside = shapely.prepare(fence)
-    del inside
+    shapely.prepare(fence)
     for yaw in _turns(fence):
         s, c = round(math.sin(yaw), 12), round(math.cos(yaw), 12)
         for middle in _middles(fence):

@@ -78,7 +78,7 @@ def plants(given: Layers, options: Options, source: Source, notes: Notes) -> Lay
     head = max(HEADLAND, need)
     site = Site(given, options, notes)
     across, along = options.rows * row_spacing, (options.columns - 1) * spacing
-    place = placed(site, along + 2 * head, across, 1.0)
+    place = placed(site, along + 2 * head, across, 1.0, row_spacing / 2 - body - options.jitter - options.robot_radius)
     site.draw(site.fence, "meadow")
     site.files.update(_plants.files_of(grown))
     chance = source.stream("places")

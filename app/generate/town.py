@@ -116,7 +116,8 @@ def _bounded(site: Site, options: Options) -> Any:
     own = shapely.box(0.0, 0.0, options.width, options.depth) if asked is None else asked
     if own.area > MOST_AREA:
         raise refused("boundary", f"{own.area / 1e6:.1f} km² are more than {MOST_AREA / 1e6:g} km²")
-    fence = site.bounded(shapely.buffer(own, MARGIN, join_style="mitre", mitre_limit=3.0))
+    around = shapely.buffer(own, MARGIN, join_style="mitre", mitre_limit=3.0)
+    fence = site.bounded(around, room=options.sidewalk / 2 - options.robot_radius)
     if not site.is_given:
         return own
     if asked is not None:
