@@ -315,10 +315,11 @@ def relay_of(settings: Settings, here: Services) -> Relay | None:
     """Events to the fleet, begun; None where they are off."""
     if settings.zenoh_mode == "off":
         return None
-    bus = Bus(
-        _bus_options(settings), ask=partial(events.ask, here), on_status=here.fleet.heard, on_alive=here.fleet.alive
-    )
-    relay = Relay(here.store, bus, settings.data_dir)
+    if settings.zenoh_users is not None and "tcp/" in settings.zenoh_listen:
+        log.warning("users of the router come in without TLS: what is said can be read and changed on the way")
+    options = _bus_options(settings)
+    made = Bus(options, ask=partial(events.ask, here), on_status=here.fleet.heard, on_alive=here.fleet.alive)
+    relay = Relay(here.store, made, settings.data_dir)
     here.fleet.start()
     relay.start()
     return relay
