@@ -1,0 +1,142 @@
+"""Cellular automata on arrays, and joining what they leave free.
+
+Arrays are bool [rows, columns]; alive, or occupied, is True.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+from numpy.typing import NDArray
+
+Bool = NDArray[np.bool_]
+I64 = NDArray[np.int64]
+
+STRIP = 2**18
+"""Cells that are worked on at a time, so that they stay in the processor's cache."""
+
+ROUNDS = 6
+
+
+def grown(alive: Bool, born: Collection[int], stays: Collection[int], iterations: int, *, outside: bool) -> Bool:
+    """The cells after so many steps. born, stays: numbers of living neighbours (of eight) with which a dead cell comes
+    alive, and a living one stays so. outside: whether what is beyond the border is alive. Ends early where nothing
+    changes any more."""
+    height, width = alive.shape
+    table = np.zeros(32, np.uint8)  # by the neighbours and itself, times two, and itself
+    for n in range(9):
+        table[2 * n] = n in born
+        table[2 * (n + 1) + 1] = n in stays
+    now = np.pad(alive.astype(np.uint8), 1, constant_values=np.uint8(outside))
+    after = now.copy()
+    rows = max(1, STRIP // width)
+    for _ in range(iterations):
+        for y in range(0, height, rows):
+            end = min(y + rows, height)
+            part = now[y : end + 2]
+            three = part[:-2] + part[1:-1]
+            three += part[2:]
+            nine = three[:, :-2] + three[:, 1:-1]
+            nine += three[:, 2:]
+            nine <<= 1
+            nine |= part[1:-1, 1:-1]
+            np.take(table, nine, out=after[y + 1 : end + 1, 1:-1], mode="clip")
+        if np.array_equal(now, after):
+            break
+        now, after = after, now
+    return now[1:-1, 1:-1].astype(bool)
+
+
+def joined(occupied: Bool, rim: Bool, radius: float, passage: float, smallest: float) -> tuple[Bool, int, int]:
+    """Occupied cells between which free space is one piece: (cells, how many were filled, how many passages were cut).
+
+    rim: cells that stay occupied. radius: of a robot, in cells: places that hold it are joined by passages (cells wide)
+    if they have at least ``smallest`` cells for its middle. What is not joined to the largest place is filled.
+    """
+    import cv2
+
+    out = occupied.copy()
+    ways = 0
+    width = max(round(passage), 2 * int(np.ceil(radius)) + 1)
+    for _ in range(ROUNDS):
+        label, sizes = _places(out, radius)
+        large = np.flatnonzero(sizes >= max(smallest, 1.0))
+        if len(large) <= 1:
+            break
+        keep = np.zeros(len(sizes), bool)
+        keep[large] = True
+        cut = np.zeros(out.shape, np.uint8)
+        for a, b in _shortest(np.where(keep[label], label, 0)):
+            cv2.line(cut, (a[1], a[0]), (b[1], b[0]), 1, thickness=width, lineType=cv2.LINE_4)
+            cv2.line(cut, (a[1], a[0]), (b[1], b[0]), 1, lineType=cv2.LINE_4)
+            ways += 1
+        before = out
+        out = out & ~((cut > 0) & ~rim)
+        if np.array_equal(before, out):
+            break
+    # The largest place of the robot, and all that is free around it; the rest is filled.
+    label, sizes = _places(out, radius)
+    if not sizes.any():
+        label, sizes = _places(out, 0.0)
+    if not sizes.any():
+        return np.ones_like(out), int(np.count_nonzero(~out)), ways
+    main = label == int(np.argmax(sizes))
+    _, free = cv2.connectedComponents((~out).astype(np.uint8), connectivity=4)
+    kept = np.asarray(free) == int(np.asarray(free)[main][0])
+    filled = int(np.count_nonzero(~out & ~kept))
+    return ~kept, filled, ways
+
+
+def _places(occupied: Bool, radius: float) -> tuple[NDArray[np.int32], I64]:
+    """Pieces of where a robot's middle may be, numbered from 1; how many cells each has (0 for the rest)."""
+    import cv2
+
+    free = (~occupied).astype(np.uint8)
+    if radius > 0.0:
+        away = cv2.distanceTransform(np.pad(free, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+        # From the middle of a cell to the border of the next obstacle, which is half a cell nearer than its middle.
+        free = (np.asarray(away) - 0.5 > radius).astype(np.uint8)
+    count, label = cv2.connectedComponents(free, connectivity=4)
+    sizes = np.bincount(np.asarray(label).ravel(), minlength=count).astype(np.int64)
+    sizes[0] = 0
+    return np.asarray(label), sizes
+
+
+def _shortest(label: NDArray[np.int32]) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Lines (row, column to row, column) that join all labelled pieces to one, the shortest first (Kruskal): between
+    the nearest cells of pieces whose surroundings touch."""
+    from scipy import ndimage  # type: ignore[import-untyped]
+
+    near = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
+    owner = label[near[0], near[1]]
+    found = []
+    for axis in (0, 1):
+        a, b = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+        differ = owner[a] != owner[b]
+        found.append(
+            np.stack(
+                [owner[a][differ], owner[b][differ], *(near[k][s][differ] for s in (a, b) for k in (0, 1))], axis=1
+            ).astype(np.int64)
+        )
+    rows = np.concatenate(found)
+    swap = rows[:, 0] > rows[:, 1]
+    rows[swap] = rows[swap][:, [1, 0, 4, 5, 2, 3]]
+    length = (rows[:, 2] - rows[:, 4]) ** 2 + (rows[:, 3] - rows[:, 5]) ** 2
+    rows = rows[np.lexsort((*rows.T[::-1], length))]
+    parent = np.arange(int(label.max()) + 1)
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = int(parent[i])
+        return i
+
+    out = []
+    _, first = np.unique(rows[:, 0] * len(parent) + rows[:, 1], return_index=True)
+    for p, q, y0, x0, y1, x1 in rows[np.sort(first)].tolist():
+        a_, b_ = root(p), root(q)
+        if a_ != b_:
+            parent[a_] = b_
+            out.append(((y0, x0), (y1, x1)))
+    return out

@@ -1,0 +1,244 @@
+"""Cellular automata: caves, forests and cluttered halls grown from random cells by a rule in B/S notation.
+
+A rule ``B5678/S45678`` says with how many of its eight neighbours a dead cell comes alive (B) and a living one stays so
+(S). Alive is what stands there: rock, trees, clutter. Afterwards the places that a robot of the given radius fits into
+are joined by passages, shortest first, and what stays apart is filled, so that free space is one piece.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.errors import CannotGenerate
+from app.generate import MAX_OBJECTS, Source, _automata, _cells, generates
+from app.generate._cells import LOOKS, Look, Place
+from app.generate._site import Site, SiteOptions, angle, disc, mm, refused
+from app.model.frame import GROUND
+from app.model.layers import Layers
+from app.parameters import parameter
+
+Bool = NDArray[np.bool_]
+
+RULE = re.compile(r"B([0-8]*)/S([0-8]*)", re.ASCII)
+
+RESOLUTION = 0.05
+
+CLUTTER = Look("obstacle", 1.2, "goods")
+
+
+@dataclass(frozen=True, slots=True)
+class CaveOptions(SiteOptions):
+    """How a cave grows."""
+
+    width: float = parameter(30.0, "along x, where no fence says it", minimum=1.0, maximum=5000.0, unit="m")
+    depth: float = parameter(30.0, "along y, where no fence says it", minimum=1.0, maximum=5000.0, unit="m")
+    cell: float = parameter(
+        0.25, "the automaton's cells; whole cells of the grid", minimum=0.01, maximum=50.0, unit="m"
+    )
+    rule: str = parameter("B5678/S45678", "with how many neighbours a cell comes alive, and stays so")
+    iterations: int = parameter(6, "how often the rule is applied", minimum=0, maximum=1000)
+    density: float = parameter(0.49, "share of cells that are alive in the beginning", minimum=0.0, maximum=1.0)
+    passage: float | None = parameter(
+        None, "width of the passages that join places [three times robot_radius]", minimum=0.0, maximum=100.0, unit="m"
+    )
+    smallest: float = parameter(
+        2.0, "places of less than this that a robot fits into are not joined", minimum=0.0, maximum=1e6, unit="m²"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class HallOptions(CaveOptions):
+    """How clutter gathers in a hall."""
+
+    width: float = parameter(20.0, "along x, where no fence says it", minimum=1.0, maximum=5000.0, unit="m")
+    depth: float = parameter(15.0, "along y, where no fence says it", minimum=1.0, maximum=5000.0, unit="m")
+    cell: float = parameter(0.4, "the automaton's cells; whole cells of the grid", minimum=0.01, maximum=50.0, unit="m")
+    rule: str = parameter("B5678/S3456", "with how many neighbours a cell comes alive, and stays so")
+    iterations: int = parameter(2, "how often the rule is applied", minimum=0, maximum=1000)
+    density: float = parameter(0.34, "share of cells that are alive in the beginning", minimum=0.0, maximum=1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class ForestOptions(SiteOptions):
+    """How woods and clearings come to be."""
+
+    width: float = parameter(60.0, "along x, where no fence says it", minimum=5.0, maximum=5000.0, unit="m")
+    depth: float = parameter(60.0, "along y, where no fence says it", minimum=5.0, maximum=5000.0, unit="m")
+    spacing: float = parameter(2.5, "the automaton's cells, each of one tree", minimum=0.5, maximum=50.0, unit="m")
+    rule: str = parameter("B5678/S345678", "with how many neighbours a cell comes alive, and stays so")
+    iterations: int = parameter(3, "how often the rule is applied", minimum=0, maximum=1000)
+    density: float = parameter(0.4, "share of cells that are alive in the beginning", minimum=0.0, maximum=1.0)
+    jitter: float = parameter(
+        0.3, "how far trees stand from their cell's middle, as a share of the spacing", minimum=0.0, maximum=0.5
+    )
+    trunk: tuple[float, float] = parameter(
+        (0.1, 0.25), "smallest,largest radius of trunks", minimum=0.02, maximum=2.0, unit="m"
+    )
+    tree_height: tuple[float, float] = parameter(
+        (6.0, 14.0), "lowest,highest tree", minimum=1.0, maximum=100.0, unit="m"
+    )
+
+
+@generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=CaveOptions, also={"location"})
+def cave(given: Layers, options: CaveOptions, source: Source, notes: Notes) -> Layers:
+    """A cave: halls and passages in rock, grown by a cellular automaton."""
+    return _grown(given, options, source, notes, LOOKS["rock"], LOOKS["rock"], ground="gravel")
+
+
+@generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=HallOptions, also={"location"})
+def cluttered_hall(given: Layers, options: HallOptions, source: Source, notes: Notes) -> Layers:
+    """A hall full of clutter that a cellular automaton heaped up."""
+    return _grown(given, options, source, notes, CLUTTER, LOOKS["wall"], ground="floor")
+
+
+@generates({"location", "objects", "occupancy", "topology", "imagery"}, parameters=ForestOptions, also={"location"})
+def forest(given: Layers, options: ForestOptions, source: Source, notes: Notes) -> Layers:
+    """A forest: trees with trunks and crowns, and clearings where a cellular automaton leaves some."""
+    for name in ("trunk", "tree_height"):
+        low, high = getattr(options, name)
+        if low > high:
+            raise refused(name, "the smaller one comes first")
+    reach = options.spacing * (0.5 - options.jitter)
+    if reach < options.trunk[1]:
+        raise refused("jitter", f"trunks of {options.trunk[1]:g} m would touch: give less jitter or a larger spacing")
+    site = Site(given, options, notes)
+    box = site.bounded(shapely.box(0.0, 0.0, options.width, options.depth)).bounds
+    columns, rows = (max(1, int((b - a) / options.spacing)) for a, b in ((box[0], box[2]), (box[1], box[3])))
+    if rows * columns > MAX_OBJECTS:
+        raise refused("spacing", f"{columns} × {rows} cells are more than {MAX_OBJECTS}: give a larger spacing")
+    born, stays = _rule(options.rule)
+    alive = source.stream("cells").random((rows, columns)) < options.density
+    alive = _automata.grown(alive, born, stays, options.iterations, outside=False)
+    _trees(site, alive, box, options, source)
+    return _cells.finished(site, options, notes, ground="meadow")
+
+
+def _grown(
+    given: Layers, options: CaveOptions, source: Source, notes: Notes, look: Look, border: Look, *, ground: str
+) -> Layers:
+    """A closed place of occupied cells whose free space is one piece."""
+    resolution = options.resolution or _fine(options)
+    step = round(options.cell / resolution)
+    if step < 1 or abs(step * resolution - options.cell) > 1e-6:
+        raise refused("cell", f"must be a whole number of cells of {resolution:g} m, got {options.cell:g} m")
+    born, stays = _rule(options.rule)
+    site = Site(given, options, notes)
+    place = _cells.placed(site, options.width, options.depth, resolution, step=step)
+    coarse = Place(place.x, place.y, options.cell, place.columns // step, place.rows // step)
+    if min(coarse.rows, coarse.columns) < 5:
+        raise refused("cell", f"{coarse.columns} × {coarse.rows} cells are too few: at least 5 × 5 are needed")
+    if coarse.rows * coarse.columns * max(options.iterations, 1) > MOST_STEPS:
+        raise refused(
+            "iterations",
+            f"{coarse.rows * coarse.columns} cells times {options.iterations} are more than {MOST_STEPS}: give fewer, "
+            "or larger cells",
+        )
+    occupied = source.stream("cells").random((coarse.rows, coarse.columns)) < options.density
+    occupied = _automata.grown(occupied, born, stays, options.iterations, outside=True)
+    rim = np.zeros(occupied.shape, bool)
+    rim[[0, -1]] = rim[:, [0, -1]] = True
+    if site.is_given:
+        rim |= ~_within(site.fence, coarse)
+    occupied |= rim
+    passage = 3 * options.robot_radius if options.passage is None else options.passage
+    joined, closed, ways = _automata.joined(
+        occupied,
+        rim,
+        options.robot_radius / options.cell,
+        max(passage / options.cell, 1.0),
+        options.smallest / options.cell**2,
+    )
+    if joined.all():
+        raise CannotGenerate("nothing is left free: give a lower density, another rule, or a smaller robot_radius")
+    notes.drop("free cells", closed, "in places apart: they are filled")
+    if ways:
+        notes.fill("passages", ways, "joined places of free space that the rule left apart")
+    if border is look:
+        _cells.stand(site, coarse, joined, look)
+    else:
+        _cells.stand(site, coarse, joined & rim, border)
+        _cells.stand(site, coarse, joined & ~rim, look)
+    return _cells.finished(site, options, notes, ground=ground)
+
+
+MOST_STEPS = 2**32
+"""Cells times iterations."""
+
+
+def _fine(options: CaveOptions) -> float:
+    """The usual resolution where the automaton's cells are whole ones of it, else these cells."""
+    step = options.cell / RESOLUTION
+    whole = abs(step - round(step)) < 1e-6 and step >= 1
+    return RESOLUTION if whole and options.width * options.depth / RESOLUTION**2 <= 2**22 else options.cell
+
+
+def _rule(text: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """(neighbours with which a cell comes alive, with which it stays so)."""
+    found = RULE.fullmatch(text.strip().upper())
+    if found is None:
+        raise refused(
+            "rule", f"must be B and S with numbers of neighbours from 0 to 8, as B5678/S45678, got {text[:40]!r}"
+        )
+    born, stays = (tuple(sorted({int(c) for c in digits})) for digits in found.groups())
+    return born, stays
+
+
+def _within(fence: Any, place: Place) -> Bool:
+    """Which cells lie inside of a fence as a whole, but those at its border."""
+    inner = shapely.buffer(fence, -place.resolution, join_style="mitre")
+    x = place.x + (np.arange(place.columns) + 0.5) * place.resolution
+    y = place.y + (np.arange(place.rows) + 0.5) * place.resolution
+    shapely.prepare(inner)
+    return np.asarray(shapely.contains_xy(inner, *np.meshgrid(x, y)), bool)
+
+
+def _trees(site: Site, alive: Bool, box: tuple[float, ...], options: ForestOptions, source: Source) -> None:
+    draw = source.stream("trees").random((*alive.shape, 5))
+    rows, columns = np.nonzero(alive)
+    floor = site.elevation(GROUND)
+    inner = shapely.buffer(site.fence, -options.trunk[1])
+    shapely.prepare(inner)
+    count = 0
+    for r, c in zip(rows.tolist(), columns.tolist(), strict=True):
+        u, v, thick, tall, turn = draw[r, c].tolist()
+        x = mm(box[0] + (c + 0.5 + (2 * u - 1) * options.jitter) * options.spacing)
+        y = mm(box[1] + (r + 0.5 + (2 * v - 1) * options.jitter) * options.spacing)
+        if not inner.contains(shapely.Point(x, y)):
+            continue
+        count += 1
+        radius = mm(options.trunk[0] + thick * (options.trunk[1] - options.trunk[0]))
+        height = mm(options.tree_height[0] + tall * (options.tree_height[1] - options.tree_height[0]))
+        stem, crown = mm(0.6 * height), mm(min(0.25 * height, options.spacing))
+        trunk: Mapping[str, Any] = {
+            "type": "cylinder",
+            "radius": radius,
+            "length": stem,
+            "pose": [0.0, 0.0, mm(stem / 2), 0.0, 0.0, 0.0],
+        }
+        leaves: Mapping[str, Any] = {
+            "type": "ellipsoid",
+            "radii": [crown, crown, mm(0.275 * height)],
+            "pose": [0.0, 0.0, mm(0.725 * height), 0.0, 0.0, 0.0],
+            "visual": True,
+        }
+        site.put(
+            f"tree/{count}",
+            "tree",
+            shapely.Point(x, y),
+            shapes=[trunk, leaves],
+            pose=(x, y, floor, angle(6.283185 * turn)),
+            colour=("crown", "crown_light", "crown_dark")[count % 3],
+            seen=disc(x, y, crown),
+            width=mm(2 * radius),
+            height=height,
+        )
+    if not count:
+        raise CannotGenerate("no tree is left: give a higher density, another rule or fewer iterations")
