@@ -364,12 +364,16 @@ def yard(out: Field) -> dict[str, float]:
         site.way(f"Yard{k + 1}", dock, speed=0.5)
         behind = mm(reach - radius - 2 * SLACK * site.resolution - 0.25)
         place = out.at(u, behind)
-        if not free.contains(rectangle(*place, out.yaw, 0.6, 0.4)):
+        open_to = lowest(out, u, min(radius + 0.3, options.headland / 2))
+        if open_to is None or open_to > reach or not free.contains(rectangle(*place, out.yaw, 0.6, 0.4)):
             raise refused("yard", f"{options.yard:g} m are too few for the docks of a robot of {radius:g} m radius")
         site.box(
             f"charger{k + 1}", "machine", place, (0.6, 0.4, 0.9), yaw=out.yaw, colour="charger", name=f"Charger {k + 1}"
         )
-    site.node("Gate", out.at(gate, _gate_v(out, gate)), yaw=out.yaw + math.pi / 2)
+    below = lowest(out, gate, min(radius + 0.5, options.headland / 2))
+    if below is None or lane.v - below < 0.5:
+        raise refused("yard", f"{options.yard:g} m are too few for a gate")
+    site.node("Gate", out.at(gate, below), yaw=out.yaw + math.pi / 2)
     site.way("YardGate", "Gate", speed=0.5)
     start = first + radius + 1.0
     depth = mm(min(5.0, lane.v - 2.5 - radius))
@@ -391,13 +395,15 @@ def yard(out: Field) -> dict[str, float]:
     return found
 
 
-def _gate_v(out: Field, u: float) -> float:
-    """v of the gate's node: as near to the fence below the lane as a robot comes."""
-    inner = out.inner(out.options.robot_radius + 0.5)
-    cut = shapely.intersection(inner, shapely.LineString([(u, inner.bounds[1] - 1), (u, out.aisles[0].v)]))
+def lowest(out: Field, u: float, margin: float) -> float | None:
+    """The lowest v below the lane that is straight ahead of it and at least a margin from the fence; None where the
+    lane itself is nearer."""
+    inner, top = out.inner(margin), out.aisles[0].v
+    if inner.is_empty:
+        return None
+    cut = shapely.intersection(inner, shapely.LineString([(u, inner.bounds[1] - 1), (u, top)]))
     pieces = [p.bounds for p in shapely.get_parts(cut) if p.geom_type == "LineString"]
-    below = [low for _, low, _, high in pieces if abs(high - out.aisles[0].v) < 1e-6]
-    return mm(min(below)) if below else out.aisles[0].v - 1.0
+    return next((mm(low) for _, low, _, high in pieces if abs(high - top) < 1e-6), None)
 
 
 def ground(out: Field, *, field_colour: str, lane_colour: str = "path") -> None:

@@ -214,9 +214,7 @@ class Site:
             pieces.sort(key=lambda p: (-p.area, *p.bounds))
             if len(pieces) > 1:
                 self.notes.drop("polygons of the fence", len(pieces) - 1, "the site lies in the largest one")
-            self.fence, self.is_given = shapely.Polygon(pieces[0].exterior), True
-            if pieces[0].interiors:
-                self.notes.drop("holes of the fence", len(pieces[0].interiors), "a fence is one ring")
+            self.fence, self.is_given = pieces[0], True
         else:
             self.fence = shapely.orient_polygons(rounded(own))
         _ = self.resolution

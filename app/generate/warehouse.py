@@ -162,26 +162,23 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
         stop = f"At{name}"
         found[stop] = u
         site.node(stop, out.at(u, lane.v), yaw=out.yaw)
-        wall = _wall_below(out, u)
+        wall, near = _field.lowest(out, u, 0.0), _field.lowest(out, u, clear)
+        if wall is None or near is None:
+            raise refused("docks", f"the lane has no room for {len(names)} docks, chargers and parking places")
         words: dict[str, Any] = {}
-        v = wall + clear
+        v = near
         if name.startswith("Dock"):
             doors.append(out.area(u - 1.25, wall - 0.6, u + 1.25, wall + WALL + 0.6))
-            site.mark(
-                f"door{k + 1}",
-                "door",
-                shapely.LineString([out.at(u - 1.25, wall), out.at(u + 1.25, wall)]),
-                name=f"Gate {k + 1}",
-            )
+            site.mark(f"door{k + 1}", "door", _door(site.fence, doors[-1]), name=f"Gate {k + 1}")
             site.draw(out.area(u - 1.25, wall, u + 1.25, wall + 2.5), "marking")
             site.draw(out.area(u - 1.1, wall, u + 1.1, wall + 2.35), "concrete")
         elif name.startswith("Charger"):
             words = {"openrmf": {"parameters": {"is_charger": [4, True], "is_parking_spot": [4, True]}}}
-            v = wall + clear + 0.5
+            v = near + 0.5
             site.box(
                 name.lower(),
                 "machine",
-                out.at(u, wall + WALL + 0.2),
+                out.at(u, mm(near + 0.5 - clear + WALL - 0.15)),
                 (0.6, 0.3, 1.2),
                 yaw=out.yaw,
                 colour="charger",
@@ -210,9 +207,8 @@ def _dispatch(site: Site, out: Field, options: Warehouse) -> dict[str, float]:
     return found
 
 
-def _wall_below(out: Field, u: float) -> float:
-    """v of the fence below the lane at a place."""
-    whole = out.inner(0.0)
-    cut = shapely.intersection(whole, shapely.LineString([(u, whole.bounds[1] - 1), (u, out.aisles[0].v)]))
-    pieces = [p.bounds for p in shapely.get_parts(cut) if p.geom_type == "LineString"]
-    return mm(max((low for _, low, _, high in pieces if abs(high - out.aisles[0].v) < 1e-6), default=0.0))
+def _door(fence: Any, gap: Any) -> Any:
+    """A door from side to side of a gap in the wall, along it."""
+    middle = shapely.intersection(shapely.boundary(shapely.buffer(fence, -WALL / 2, join_style="mitre")), gap)
+    parts = shapely.get_parts(shapely.line_merge(middle))
+    return max(parts, key=shapely.length)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import random
 import re
 from collections import Counter
 from pathlib import Path
@@ -39,7 +40,7 @@ DIGESTS = {
     "crop_rows": "fe25e32f54d9cd9b4cf4491e74b640e1a0d1abe59ba9e91f4b9d5dd75c888a1e",
     "polytunnels": "939fd4b7d5ceb306387a15471b4e6ed6c4461643da228bd24b535bce23971c40",
     "vineyard": "e1545af753dd6513aa5275f088a6019ec5ac1e0393f94b119eb94f8584cffba8",
-    "warehouse": "46d013456bd2b5bb8eb50cde47975705adda8eb55f5c2fa5028942e33d4b54f9",
+    "warehouse": "2fe05ca2ce9298ccdb9f90199c5f9136aceb6c4c0a8296e12b340435244dbc15",
 }
 HERE = Datum(53.2686, -0.5245, heading=12.0)
 FENCES = {
@@ -216,6 +217,35 @@ def test_one_way_aisles_go_there_and_back() -> None:
 def test_what_cannot_be_made_is_told_before_any_work(name: str, values: dict[str, Any], why: str) -> None:
     with pytest.raises((CannotGenerate, Invalid), match=why):
         looks.make(name, **values)
+
+
+@pytest.mark.parametrize("name", sorted(SMALL))
+def test_whatever_the_fence_it_is_a_site_or_a_reason(name: str) -> None:
+    chance = random.Random(f"fences for {name}")
+    key = PartKey("location", GROUND, "site")
+    made = 0
+    for number in range(6):
+        size = chance.uniform(35, 80)
+        ring = [
+            (math.cos(0.9 * k) * chance.uniform(0.4, 1), math.sin(0.9 * k) * chance.uniform(0.4, 1)) for k in range(7)
+        ]
+        fence = shapely.Polygon([(size * x / 1.4, size * y / 1.4) for x, y in ring])
+        if number % 2:
+            boxes = [(chance.uniform(0, size / 2), chance.uniform(0, size / 2)) for _ in range(3)]
+            fence = shapely.union_all([shapely.box(x, y, x + size / 2, y + size / 3) for x, y in boxes])
+        fence = max(shapely.get_parts(fence.buffer(0)), key=shapely.area)
+        fence = shapely.difference(fence, shapely.point_on_surface(fence).buffer(1.0)) if number == 3 else fence
+        part = features([("f", fence, {"kind": "fence"})], "local")
+        values = {"robot_radius": chance.choice((0.2, 0.25)), "headland": chance.choice((3, 5))}
+        try:
+            layers, _ = looks.make(name, number, Layers({key: part}, HERE), resolution=0.1, **values)
+        except CannotGenerate as error:
+            assert error.problems[0].where in {"yard", "docks", "headland", "rows_per_tunnel"}, error.detail
+            continue
+        made += 1
+        for found in (*layers.vector("objects").values(), *layers.vector("topology").values()):
+            assert shapely.contains(fence.buffer(0.05), found.geometry).all()
+    assert made >= 3
 
 
 def test_a_fence_that_holds_nothing_is_told() -> None:
