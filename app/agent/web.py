@@ -6,7 +6,6 @@ import base64
 import hashlib
 import json
 import os
-import ssl
 import sys
 import threading
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,6 +18,7 @@ import httpx
 
 from app.agent.trust import File
 from app.errors import Denied, FleetMapError, Invalid, NotFound, Unavailable, Untrusted
+from app.events.login import trusting
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -52,14 +52,6 @@ class Busy(Unavailable):
     def __init__(self, detail: str, seconds: float = 0.0) -> None:
         super().__init__(detail)
         self.seconds = seconds
-
-
-def trusting(ca: Path) -> ssl.SSLContext:
-    """TLS that believes certificates of this certification authority alone. Raises Invalid."""
-    try:
-        return ssl.create_default_context(cafile=ca)
-    except (OSError, ssl.SSLError) as error:
-        raise Invalid(f"{ca} holds no certificate of a certification authority (PEM): {error}") from error
 
 
 class Web:

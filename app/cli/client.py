@@ -17,8 +17,8 @@ from urllib.parse import quote, urljoin
 
 import httpx
 
-from app.agent.web import trusting
 from app.cli.output import Bar, progress_bar
+from app.events.login import trusting
 
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 API = "/api/v1"

@@ -1,7 +1,8 @@
-"""How a Zenoh session shows who it is, and knows whom it talks to: TLS, and a user with a password."""
+"""How a client shows who it is, and knows whom it talks to: TLS, and for Zenoh a user with a password."""
 
 from __future__ import annotations
 
+import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -45,3 +46,11 @@ def file_of(path: Path) -> str:
             return str(path.resolve())
     except OSError as error:
         raise Invalid(f"{path} cannot be read: {error.strerror or error}") from error
+
+
+def trusting(ca: Path) -> ssl.SSLContext:
+    """TLS that believes certificates of this certification authority alone. Raises Invalid."""
+    try:
+        return ssl.create_default_context(cafile=ca)
+    except (OSError, ssl.SSLError) as error:
+        raise Invalid(f"{ca} holds no certificate of a certification authority (PEM): {error}") from error

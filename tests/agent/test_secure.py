@@ -8,9 +8,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from app.agent.core import Agent, Options
+from app.errors import Invalid
+from app.events.login import Login
 from tests.agent.conftest import ROOT, Robot, network
 from tests.api.conftest import ADMIN, Api, running, settings_for
 from tests.certificates import Authority
@@ -107,15 +111,22 @@ def test_an_agent_believes_no_other_authority(secure: Api, tmp_path: Path) -> No
             one.kill()
         assert "certificate" in str(one.lines).lower()
         assert not (tmp_path / "robot" / "current").exists()
-    for more, told in (
-        (("--ca", str(tmp_path / "gone.pem")), "gone.pem"),
-        (("--zenoh-ca", str(tmp_path / "gone.pem")), "gone.pem cannot be read"),
-        (("--zenoh-certificate", str(other.pem)), "needs its key"),
-        (("--zenoh-user", "tractor"), "needs a password"),
-    ):
-        one = Robot(secure.url, env, tmp_path / "robot", "--once", *more)
-        assert one.end() != 0
-        assert told in " ".join(str(line.get("text")) for line in one.lines), one.lines
+
+
+def test_what_an_agent_is_given_is_looked_at_first(authority: Authority, tmp_path: Path) -> None:
+    gone = tmp_path / "gone.pem"
+    key = tmp_path / "no.pem"
+    key.write_text("no certificate")
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"ca": gone}, "gone.pem"),
+        ({"ca": key}, "no certificate of a certification authority"),
+        ({"zenoh_login": Login(ca=gone)}, "gone.pem cannot be read"),
+        ({"zenoh_login": Login(certificate=authority.pem)}, "needs its key"),
+        ({"zenoh_login": Login(user="tractor")}, "needs a password"),
+    ]
+    for more, told in cases:
+        with pytest.raises(Invalid, match=told):
+            Agent(Options("https://127.0.0.1:1", "farm", ("tmap2",), tmp_path / "robot", **more), lambda *_, **__: None)
 
 
 def test_the_command_line_over_https(secure: Api, authority: Authority) -> None:
