@@ -726,7 +726,10 @@ class GeneratorOut(BaseModel):
     id: str
     title: str
     gives: list[str]
-    needs: list[str] = Field(description="Layers that it works on; without any it makes a whole site.")
+    needs: list[str] = Field(description="Layers that it works on.")
+    changes: list[str] = Field(
+        description="Layers that it works on where they are there, one at least. With neither it makes a whole site."
+    )
     version: int
     parameters: list[dict[str, Any]]
 

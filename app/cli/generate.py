@@ -87,7 +87,7 @@ def _list(*, as_json: bool) -> None:
             (
                 one["id"],
                 one["title"],
-                ", ".join(one["needs"]) or "nothing",
+                ", ".join(one["needs"]) or " or ".join(one["changes"]) or "nothing",
                 ", ".join(one["gives"]),
                 ", ".join(p["name"] for p in one["parameters"]),
             )
@@ -120,9 +120,9 @@ def _write(
 
     known = generate.get_generator(site)
     formats.get_format(to)
-    if known.needs:
+    if known.works_on:
         raise Invalid(
-            f"{site} works on {', '.join(sorted(known.needs))} of an environment: name one with --environment"
+            f"{site} works on {', '.join(sorted(known.works_on))} of an environment: name one with --environment"
         )
     ours = {p["name"] for p in parameters.describe(known.parameters)}
     own = {n: v for n, v in values.items() if n in ours}

@@ -307,6 +307,21 @@ class _Reader:
         self.notes.drop("objects", len(self.broken), "their solids cannot be read")
 
 
+def body_of(properties: Properties, geometry: Any, known: solids.Solids) -> Any | None:
+    """The ground that one object covers, whatever its height: a polygon in metres; None where it stands in no way.
+
+    geometry: in local metres. Raises Invalid or BadUpload where its solids cannot be read.
+    """
+    kind = str(properties.get("kind") or "")
+    if kind in FREE or kind in IGNORED or kind in DOORS:
+        return None
+    if properties.get("shapes"):
+        shadow = known.footprint(properties)
+        return None if shadow.is_empty else shadow
+    width = 0.1 if kind in HOLES else _width(kind, properties)
+    return None if width is None else _body(shapely.force_2d(geometry), properties, width)
+
+
 def _tags(p: Properties) -> Mapping[str, Any]:
     own = p.get("osm")
     tags = own.get("tags") if isinstance(own, Mapping) else None

@@ -53,8 +53,9 @@ place of those with the same key; one that is passed on as it was given is left 
 
 @dataclass(frozen=True, slots=True)
 class Generator:
-    """One way to make layers up. needs: layers that it works on and may replace. also: those that it looks at where
-    they are there (a fence). Without needs it makes a whole site, and takes the place of an earlier made-up one."""
+    """One way to make layers up. needs: layers that it works on and may replace. changes: layers that it works on where
+    they are there, one of them at least. also: those that it looks at where they are there (a fence). With neither
+    needs nor changes it makes a whole site, and takes the place of an earlier made-up one."""
 
     name: str
     title: str
@@ -64,11 +65,17 @@ class Generator:
     version: int
     parameters: type[Any]
     function: Function
+    changes: frozenset[Layer] = frozenset()
 
     @property
     def reads(self) -> frozenset[Layer]:
         """All layers that it looks at."""
-        return self.needs | self.also
+        return self.works_on | self.also
+
+    @property
+    def works_on(self) -> frozenset[Layer]:
+        """Layers that it may replace; empty where it makes a whole site."""
+        return self.needs | self.changes
 
     def as_dict(self) -> dict[str, Any]:
         """The generator as clients see it."""
@@ -77,6 +84,7 @@ class Generator:
             "title": self.title,
             "gives": sorted(self.gives),
             "needs": sorted(self.needs),
+            "changes": sorted(self.changes),
             "version": self.version,
             "parameters": parameters.describe(self.parameters),
         }
@@ -91,6 +99,7 @@ def generates(
     parameters: type[Any],
     needs: frozenset[Layer] | set[Layer] = frozenset(),
     also: frozenset[Layer] | set[Layer] = frozenset(),
+    changes: frozenset[Layer] | set[Layer] = frozenset(),
     version: int = 1,
 ) -> Callable[[Function], Function]:
     """Declare a function as a generator; its name is its id, its docstring's first line its title."""
@@ -101,7 +110,7 @@ def generates(
             raise ValueError(f"generator {name} is declared twice")
         title = (function.__doc__ or name).strip().splitlines()[0]
         layers = (frozenset(gives), frozenset(needs), frozenset(also))
-        _registry[name] = Generator(name, title, *layers, version, parameters, function)
+        _registry[name] = Generator(name, title, *layers, version, parameters, function, frozenset(changes))
         return function
 
     return declare
@@ -147,6 +156,11 @@ def run(name: str, seed: int, values: Mapping[str, Any], given: Layers, notes: N
     if lacking:
         raise MissingLayer(
             f"{name} works on {', '.join(sorted(lacking))}, and there is none: upload a map or generate one first"
+        )
+    if known.changes and not known.changes & given.layers:
+        raise MissingLayer(
+            f"{name} works on {' or '.join(sorted(known.changes))}, and there is none: upload a map or generate one "
+            "first"
         )
     made = known.function(given, options, Source(seed, name), notes)
     fresh = {k: p for k, p in made.parts.items() if given.parts.get(k) is not p and not is_empty(p)}

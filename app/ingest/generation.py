@@ -37,7 +37,7 @@ def prepare_generation(
     store = open_store(database_url, blob_dir)
     known, _ = generate.check(order.generator, order.seed, order.values)
     used = {e.key: e for e in base.parts if e.count > 0 and e.key.layer in known.reads}
-    if not known.needs:
+    if not known.works_on:
         used = {k: e for k, e in used.items() if not _made_up(e)}
     loaded = store.load(base, sorted(used))
     given = Layers(loaded.parts, base.datum, base.levels)
@@ -51,7 +51,7 @@ def prepare_generation(
     sources = tuple(sorted({s for e in used.values() for s in e.provenance.sources}))
     provenance = Provenance("generated", None, sources, None, (how,), credit)
     operations: list[Operation] = [Replace(key, part, provenance) for key, part in sorted(made.parts.items())]
-    if not known.needs:
+    if not known.works_on:
         operations += [Drop(key) for key in sorted(own) if key not in made.parts and _made_up(own[key])]
     datum = made.datum if made.datum != base.datum else KEEP
     levels = made.levels if made.levels != base.levels else KEEP
@@ -69,7 +69,7 @@ def _check_free(order: Order, known: generate.Generator, made: Layers, own: Mapp
     """A generator may replace what it was made to work on, and its like's work; the rest only where asked."""
     for key in sorted(made.parts):
         entry = own.get(key)
-        if entry is None or order.replace or key.layer in known.needs or _made_up(entry):
+        if entry is None or order.replace or key.layer in known.works_on or _made_up(entry):
             continue
         edited, kind = entry.provenance.edited, entry.provenance.information
         why = f"was {kind} and then edited" if edited else f"is {kind}"

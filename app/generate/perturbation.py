@@ -1,0 +1,859 @@
+"""Perturbation: an environment as it may be tomorrow, for studies of how much a fleet stands.
+
+Level by level: objects that are no part of the building are shifted and turned, whole rows of them as rows, some are
+gone, and new obstacles stand where it was free. The grids follow: what changes of a slice of the objects changes in
+them. A level that has a grid and no objects with a body has its pieces of occupied cells moved instead. Then sensors'
+noise is laid on the grids, more of it far from where the robots drive: false obstacles, edges that are worn away or
+grown, patches that were not seen. The network loses, or has marked as blocked, what the obstacles now stand in the way
+of.
+
+Robots have driven along the network and seen it from near: there is no noise within their radius of its edges. What
+stands there stands in the way because an obstacle does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.derive._obstacles import body_of
+from app.derive.objects_to_occupancy import Parameters as Slice
+from app.derive.objects_to_occupancy import objects_to_occupancy
+from app.derive.occupancy_to_voxels import MASKS
+from app.errors import BadUpload, CannotConvert, CannotGenerate, Invalid, Problem
+from app.generate import MAX_CELLS, MAX_OBJECTS, Source, generates
+from app.model import masks, solids
+from app.model.features import Features, features
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import MAP, Layers, Part, PartKey
+from app.parameters import parameter
+
+Array = NDArray[np.float64]
+Cells = NDArray[np.int64]
+
+NAME = "perturbation"
+"""The family of new obstacles."""
+
+STAYS = frozenset(
+    {
+        *("wall", "fence", "hedge", "barrier", "railing", "building", "door", "floor", "lift", "hole", "water", "pond"),
+        *("ditch", "stream", "pillar", "column", "stairs", "field", "terrain", "ground_plane", "light"),
+    }
+)
+"""Kinds of objects that are built, or are ground: they do not move."""
+
+ROW = 3
+"""Things in a row, at least."""
+
+SHAPELESS = 0.25
+"""Metres around a model of which nobody has supplied the shape."""
+
+TRIES = 40
+"""Places that are tried for each new obstacle."""
+
+PIECES = 20_000
+"""Pieces of occupied cells that are moved; with more the grid is rather noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Perturbation:
+    """How much is disturbed. The defaults are mild."""
+
+    severity: float = parameter(
+        1.0, "factor on all that follows but sizes and distances; 0: nothing changes", minimum=0.0, maximum=10.0
+    )
+    level: str | None = parameter(None, "only this level; default: all")
+    grid: str | None = parameter(
+        None, "only this grid has noise; default: all but costmap filter masks. All maps follow the objects"
+    )
+    shift: float = parameter(0.1, "how far a thing is moved at most", minimum=0.0, maximum=100.0, unit="m")
+    turn: float = parameter(5.0, "how far it is turned at most", minimum=0.0, maximum=180.0, unit="°")
+    row_shift: float = parameter(
+        0.15, "how far a whole row of things is moved at most", minimum=0.0, maximum=100.0, unit="m"
+    )
+    missing: float = parameter(0.03, "share of the things that are gone", minimum=0.0, maximum=1.0)
+    largest: float = parameter(
+        5.0, "things that are longer neither move nor go", minimum=0.05, maximum=1000.0, unit="m"
+    )
+    obstacles: int = parameter(3, "new obstacles on each level", minimum=0, maximum=10_000)
+    obstacle_size: tuple[float, float] = parameter(
+        (0.3, 1.0), "least and most metres across a new obstacle", minimum=0.05, maximum=50.0, unit="m"
+    )
+    speckle: float = parameter(0.0005, "share of far free cells that are wrongly occupied", minimum=0.0, maximum=0.5)
+    erode: float = parameter(0.05, "share of obstacles' edge cells that are lost", minimum=0.0, maximum=1.0)
+    dilate: float = parameter(0.05, "share of cells beside obstacles that are occupied", minimum=0.0, maximum=1.0)
+    dropped: int = parameter(2, "patches of each grid that are unknown", minimum=0, maximum=10_000)
+    patch: float = parameter(1.5, "metres across such a patch, at most", minimum=0.05, maximum=1000.0, unit="m")
+    sensor_range: float = parameter(
+        10.0, "distance from where robots drive at which noise is full", minimum=0.1, maximum=1000.0, unit="m"
+    )
+    robot_radius: float = parameter(
+        0.3, "an edge that is nearer to a new obstacle cannot be taken", minimum=0.0, maximum=5.0, unit="m"
+    )
+    edges: Literal["remove", "block"] = parameter(
+        "remove", "what happens to edges that cannot be taken: gone, with nodes that are covered, or marked as blocked"
+    )
+
+
+@dataclass(slots=True)
+class _Thing:
+    """One object, or piece of a grid. at: its middle. body: the ground it covers (metres). row: its row, or -1.
+
+    moved: (dx, dy, turn); None: it stays for good. gone: whether it is missing.
+    """
+
+    place: tuple[PartKey, int] | int
+    at: tuple[float, float]
+    body: Any
+    row: int = -1
+    moved: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
+    gone: bool = False
+
+    @property
+    def changed(self) -> bool:
+        return self.gone or (self.moved is not None and any(self.moved))
+
+    def now(self) -> Any:
+        """The ground it covers now."""
+        return self.body if self.moved is None or not any(self.moved) else _moved(self.body, self.at, self.moved)
+
+
+@dataclass(slots=True)
+class _Change:
+    """What a level's obstacles cover no more, cover now, and covered before, as squares of ``size`` metres: int64 [n,
+    2], (column, row) from the local origin; of size 0 they are cells of the grid itself."""
+
+    size: float
+    freed: Cells = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    filled: Cells = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    before: Cells = field(default_factory=lambda: np.empty((0, 2), np.int64))
+
+
+@generates(
+    {"objects", "occupancy", "topology"},
+    changes={"objects", "occupancy", "topology"},
+    also={"resources", "location"},
+    parameters=Perturbation,
+)
+def perturbation(given: Layers, options: Perturbation, source: Source, notes: Notes) -> Layers:
+    """The environment disturbed: things shifted, missing and new, noise on its grids, a network that still fits.
+
+    Objects stay in their family and keep their ids; new ones are of the family ``perturbation``. Grids keep their
+    frame. Voxels, zones and pictures are not changed. Raises CannotGenerate where it is too large, or there is no such
+    level.
+    """
+    low, high = options.obstacle_size
+    if low > high:
+        raise Invalid("obstacle_size: least comes first", [Problem("least comes first", where="obstacle_size")])
+    cells = sum(g.cells.size for g in given.grids().values())
+    objects = sum(len(p) for p in given.vector("objects").values())
+    if cells > MAX_CELLS or objects > MAX_OBJECTS:
+        raise CannotGenerate(
+            f"there are {cells} cells and {objects} objects; at most {MAX_CELLS} and {MAX_OBJECTS} can be disturbed: "
+            "cut the environment, or make its grid coarser"
+        )
+    levels = sorted({k.level for k in given.parts if k.layer in ("objects", "occupancy", "topology")})
+    if options.level is not None:
+        if options.level not in levels:
+            reason = f"there is no level {options.level!r} to disturb; there are: {', '.join(levels)}"
+            raise CannotGenerate(f"level: {reason}", [Problem(reason, where="level")])
+        levels = [options.level]
+    if options.severity == 0.0:
+        raise CannotGenerate("severity: 0 changes nothing", [Problem("0 changes nothing", where="severity")])
+    if options.grid is not None and options.grid not in {k.name for k in given.grids()}:
+        there = ", ".join(sorted({k.name for k in given.grids()})) or "none"
+        reason = f"there is no grid {options.grid!r} to disturb; there are: {there}"
+        raise CannotGenerate(f"grid: {reason}", [Problem(reason, where="grid")])
+    parts: dict[PartKey, Part] = {}
+    for level in levels:
+        parts |= _Level(given, options, source, notes, level).made()
+    if not parts:
+        told = "; ".join(f"{w.where}: {w.problem}" for w in notes.warnings)
+        told += "".join(f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped)
+        raise CannotGenerate(
+            f"nothing is disturbed by these parameters{': ' + told.removeprefix('; ') if told else ''}: ask for more, "
+            "or upload or derive objects that stand in the way, or a grid"
+        )
+    if options.edges == "remove":
+        parts |= _without_lost(given, parts, notes)
+    notes.warn("voxels, zones and pictures are as they were: derive them anew where they are to fit")
+    return Layers(parts, given.datum, given.levels)
+
+
+class _Level:
+    """One level on its way."""
+
+    def __init__(self, given: Layers, options: Perturbation, source: Source, notes: Notes, level: str) -> None:
+        self.given, self.options, self.source, self.notes, self.level = given, options, source, notes, level
+        self.parts: dict[PartKey, Features] = {k: p for k, p in given.vector("objects", level).items() if len(p)}
+        grids = given.grids(level)
+        masked = {k for k, g in grids.items() if k.name in MASKS or masks.NAME in g.properties}
+        self.maps = {k: g for k, g in grids.items() if k not in masked}
+        noisy = self.maps if options.grid is None else {k: g for k, g in grids.items() if k.name == options.grid}
+        self.noisy, self.grids = frozenset(noisy), {**self.maps, **noisy}
+        self.lines = {k: p for k, p in given.vector("topology", level).items() if len(p)}
+
+    def draw(self, name: str) -> np.random.Generator:
+        """Chance for one purpose on this level."""
+        return self.source.stream(f"{self.level}/{name}")
+
+    def made(self) -> dict[PartKey, Part]:
+        """The parts of the level that are changed."""
+        out: dict[PartKey, Part] = {}
+        things = self._things()
+        known = self.maps if things else {k: g for k, g in self.grids.items() if k in self.noisy}
+        first = next((k for k in known if k.name == MAP), next(iter(known), None))
+        main = None if first is None else known[first]
+        if things:
+            change, objects = self._objects(things, main)
+            out |= objects
+            changes = dict.fromkeys(self.maps, change)
+        elif first is not None:
+            changes = {k: self._pieces(k, g) for k, g in known.items()}
+            change = changes[first]
+        else:
+            self.notes.warn("it has neither objects that stand in the way nor a grid", where=self.level)
+            return out
+        network, kept = self._network(change, main)
+        out |= network
+        for key, grid in self.grids.items():
+            cells = _applied(grid, changes[key]) if key in changes else grid.cells
+            if key in self.noisy:
+                cells = self._noise(key, grid, cells, kept)
+            if not np.array_equal(cells, grid.cells):
+                out[key] = replace(grid, cells=cells)
+        return out
+
+    # --- objects -----------------------------------------------------------------------------------------------------
+    def _things(self) -> list[_Thing]:
+        """Everything with a body, those that may move first told apart from those that stay."""
+        known = solids.Solids(self.given.resources())
+        out: list[_Thing] = []
+        for key, part in self.parts.items():
+            metres = part.in_local(self.given.frame)
+            for k, (p, geometry) in enumerate(zip(part.properties, metres, strict=True)):
+                try:
+                    body = body_of(p, geometry, known)
+                except (Invalid, BadUpload) as error:
+                    self.notes.warn(f"it stays as it is: {error.detail}", where=part.ids[k])
+                    continue
+                if (body is None or body.is_empty) and p.get("kind") in ("model", "include") and not geometry.is_empty:
+                    body = shapely.centroid(geometry).buffer(SHAPELESS)  # its files are elsewhere
+                if body is None or body.is_empty:
+                    continue
+                x0, y0, x1, y1 = body.bounds
+                pose = p.get("pose")
+                middle = ((x0 + x1) / 2, (y0 + y1) / 2) if pose is None else solids.pose_of(p)[:2]
+                woven = isinstance(p.get("osm"), dict) and shapely.get_type_id(geometry) != 0  # its nodes would stay
+                stays = str(p.get("kind")) in STAYS or math.hypot(x1 - x0, y1 - y0) > self.options.largest or woven
+                thing = _Thing((key, k), (float(middle[0]), float(middle[1])), body)
+                if stays:
+                    thing.moved = None
+                out.append(thing)
+        return out
+
+    def _objects(self, things: list[_Thing], main: OccupancyGrid | None) -> tuple[_Change, dict[PartKey, Part]]:
+        """What changes of the obstacles, and the parts of objects that do."""
+        loose = [t for t in things if t.moved is not None]
+        rows = _rows(np.array([t.at for t in loose]).reshape(-1, 2))
+        for t, row in zip(loose, rows.tolist(), strict=True):
+            t.row = row
+        self._shaken(loose)
+        back = _apart(things)
+        if back:
+            self.notes.drop("shifts", back, "another thing stands there")
+        fresh = self._obstacles(things, main or self._slice(self.given.parts, None))
+        told = self._told(things)
+        out: dict[PartKey, Part] = {}
+        for key, part in self.parts.items():
+            mine = {t.place[1]: t for t in things if isinstance(t.place, tuple) and t.place[0] == key and t.changed}
+            if mine:
+                out[key] = _changed(part, mine, self.given)
+        if fresh:
+            key = PartKey("objects", self.level, NAME)
+            before = out.get(key, self.parts.get(key))
+            assert before is None or isinstance(before, Features)
+            out[key] = _joined(before, fresh)
+            told.append(f"{len(fresh)} new obstacles")
+        if told:
+            self.notes.warn(f"disturbed: {', '.join(told)}", where=self.level)
+        merged = {**self.parts, **out}
+        return self._sliced(merged, main), out
+
+    def _told(self, things: Sequence[_Thing]) -> list[str]:
+        gone = sum(t.gone for t in things)
+        moved = sum(t.changed for t in things) - gone
+        rows = len({t.row for t in things if t.row >= 0 and t.moved is not None})
+        said = [f"{moved} things moved" + (f" ({rows} rows)" if rows else "")] if moved else []
+        return said + ([f"{gone} gone"] if gone else [])
+
+    def _shaken(self, loose: list[_Thing]) -> None:
+        """Draw what goes, and how far what stays is moved."""
+        s, options = self.options.severity, self.options
+        go = self.draw("missing").random(len(loose)) < min(options.missing * s, 1.0)
+        by = self.draw("shift").random((len(loose), 3)) * 2 - 1
+        rows = self.draw("rows").random((max((t.row for t in loose), default=-1) + 1, 2)) * 2 - 1
+        for t, gone, (dx, dy, turn) in zip(loose, go.tolist(), by.tolist(), strict=True):
+            if gone:
+                t.gone = True
+                continue
+            along = rows[t.row].tolist() if t.row >= 0 else (0.0, 0.0)
+            half = math.sqrt(0.5)  # so that the most is the most in any direction
+            x = half * s * (dx * options.shift + along[0] * options.row_shift)
+            y = half * s * (dy * options.shift + along[1] * options.row_shift)
+            angle = math.radians(min(options.turn * s, 180.0)) * turn
+            t.moved = (round(x, 3) + 0.0, round(y, 3) + 0.0, round(angle, 6) + 0.0)
+
+    def _sliced(self, merged: dict[PartKey, Any], main: OccupancyGrid | None) -> _Change:
+        """What a slice of the objects shows now and did not before, and the other way round."""
+        said = main.properties.get("slice") if main is not None else None
+        height = said.get("height") if isinstance(said, dict) else None
+        size = None if main is None else main.resolution
+        asked = Slice(height=height, resolution=size, padding=0.0)
+        rest = {k: p for k, p in self.given.parts.items() if k.layer == "resources"}
+        found: list[OccupancyGrid | None] = []
+        for objects in (self.parts, merged):
+            grid = self._slice({**rest, **objects}, asked)
+            found.append(grid)
+            size = size if grid is None else grid.resolution
+            asked = replace(asked, resolution=size)
+        if size is None:
+            return _Change(1.0)
+        before, after = (_occupied(g) if g is not None else np.empty(0, np.int64) for g in found)
+        freed, filled = np.setdiff1d(before, after, True), np.setdiff1d(after, before, True)
+        return _Change(size, _places(freed), _places(filled), _places(before))
+
+    def _slice(self, parts: Mapping[PartKey, Part], asked: Slice | None) -> OccupancyGrid | None:
+        """The level's grid of these objects; None where nothing stands there at that height."""
+        kept = {k: p for k, p in parts.items() if k.layer in ("resources", "location") or k.level == self.level}
+        try:
+            made = objects_to_occupancy(Layers(kept, self.given.datum, self.given.levels), asked or Slice(), Notes())
+        except CannotConvert:
+            return None
+        return made.grids(self.level).get(PartKey("occupancy", self.level, MAP))
+
+    # --- new obstacles -----------------------------------------------------------------------------------------------
+    def _obstacles(self, things: Sequence[_Thing], main: OccupancyGrid | None) -> list[tuple[str, Any, dict[str, Any]]]:
+        """New objects where it is free."""
+        rng = self.draw("obstacles")
+        bodies = [t.now() for t in things if t.moved is not None and not t.gone]  # the grid shows all the others
+        tree = shapely.STRtree(bodies)
+        new: list[Any] = []
+        rows: list[tuple[str, Any, dict[str, Any]]] = []
+        where = self._room(main)
+        count = self._many(self.options.obstacles)
+        floor = self.given.elevation(self.level)
+        taken = {i for part in self.parts.values() for i in part.ids}
+        for _ in range(count if where is not None else 0):
+            shape, yaw, high, size = self._body(rng)
+            for _ in range(TRIES):
+                assert where is not None
+                x, y = where(rng)
+                body = _moved(shape, (0.0, 0.0), (x, y, yaw))
+                near = [bodies[k] for k in tree.query(body)] + new
+                if not any(shapely.intersects(body, other) for other in near):
+                    break
+            else:
+                continue
+            number = len(rows) + 1
+            while f"new/{number}" in taken:
+                number += 1
+            taken.add(f"new/{number}")
+            new.append(body)
+            solid: dict[str, Any] = {"type": "cylinder", "radius": size[0] / 2, "length": high}
+            if len(size) == 2:
+                solid = {"type": "box", "size": [*size, high]}
+            solid["pose"] = [0.0, 0.0, round(high / 2, 4), 0.0, 0.0, 0.0]
+            wide = [size[0], size[-1], high]
+            said = {"kind": "obstacle", "pose": [x, y, floor, 0.0, 0.0, yaw], "size": wide, "height": high}
+            rows.append((f"new/{number}", body, {**said, "shapes": [solid]}))
+        if len(rows) < count:
+            self.notes.drop("new obstacles", count - len(rows), f"there is no room for them on {self.level}")
+        return rows
+
+    def _body(self, rng: np.random.Generator) -> tuple[Any, float, float, list[float]]:
+        """(its outline around 0, yaw, height, sizes) of a box, or of a cylinder, which has one size."""
+        kind, a, b, turn, tall = rng.random(5).tolist()
+        low, high = self.options.obstacle_size
+        long, wide = (round(low + (high - low) * v, 3) for v in (a, b))
+        height = round(0.4 + 1.2 * tall, 2)
+        if kind < 0.5:
+            return _ring(long / 2), 0.0, height, [long]
+        return shapely.box(-long / 2, -wide / 2, long / 2, wide / 2), round(math.pi * turn, 6), height, [long, wide]
+
+    def _room(self, main: OccupancyGrid | None) -> Callable[[np.random.Generator], tuple[float, float]] | None:
+        """A function that draws a place in the open; None where there is none."""
+        if main is None:
+            return None
+        spots = _open(main.cells, self.options.obstacle_size[1] / main.resolution)
+
+        def drawn(rng: np.random.Generator) -> tuple[float, float]:
+            row, column = divmod(int(spots[int(rng.integers(len(spots)))]), main.width)
+            x, y = _metres(main, np.array([[column + 0.5, row + 0.5]]))[0].tolist()
+            return round(x, 3) + 0.0, round(y, 3) + 0.0
+
+        return drawn if len(spots) else None
+
+    def _many(self, count: int) -> int:
+        """A count by severity."""
+        return min(round(count * self.options.severity), MAX_OBJECTS)
+
+    # --- a grid without objects --------------------------------------------------------------------------------------
+    def _pieces(self, key: PartKey, grid: OccupancyGrid) -> _Change:
+        """Its small pieces of occupied cells moved and gone, and new ones: as cells of the grid itself."""
+        import cv2
+
+        occupied = (grid.cells == OCCUPIED).astype(np.uint8)
+        _, label, stats, _ = cv2.connectedComponentsWithStats(occupied, connectivity=8)
+        size = grid.resolution
+        most = self.options.largest / size
+        fits = (np.hypot(stats[:, 2], stats[:, 3]) <= most) & (stats[:, 4] >= 4)
+        fits[0] = False
+        pieces = np.flatnonzero(fits)
+        if len(pieces) > PIECES:
+            self.notes.drop("pieces of the grid", len(pieces) - PIECES, f"at most {PIECES} are moved")
+            pieces = pieces[:PIECES]
+        loose = []
+        for k in pieces.tolist():
+            x, y, w, h, _ = (int(v) for v in stats[k])
+            loose.append(_Thing(k, ((x + w / 2) * size, (y + h / 2) * size), None))
+        for t, row in zip(loose, _rows(np.array([t.at for t in loose]).reshape(-1, 2)).tolist(), strict=True):
+            t.row = row
+        self._shaken(loose)
+        cells = grid.cells.copy()
+        held = 0
+        for t in loose:
+            assert isinstance(t.place, int)
+            x, y, w, h, _ = (int(v) for v in stats[t.place])
+            inside = label[y : y + h, x : x + w] == t.place
+            cells[y : y + h, x : x + w][inside] = FREE
+            dx, dy = (0, 0) if t.gone or t.moved is None else (round(t.moved[0] / size), round(t.moved[1] / size))
+            into = _window(cells, x + dx, y + dy, w, h)
+            if not t.gone and (into is None or (cells[into][inside] != FREE).any()):
+                t.moved, into = (0.0, 0.0, 0.0), _window(cells, x, y, w, h)
+                held += 1
+            elif (dx, dy) == (0, 0) and not t.gone:
+                t.moved = (0.0, 0.0, 0.0)
+            if not t.gone and into is not None:
+                cells[into][inside] = OCCUPIED
+        if held:
+            self.notes.drop("shifts", held, "another thing stands there, or it is not known what does")
+        added = self._painted(key, grid, cells)
+        told = self._told(loose) + ([f"{added} new obstacles"] if added else [])
+        if told:
+            self.notes.warn(f"disturbed, by its cells: {', '.join(told)}", where=f"{self.level}/{key.name}")
+        row, column = np.nonzero((grid.cells == OCCUPIED) & (cells != OCCUPIED))
+        freed = np.stack([column, row], axis=1)
+        row, column = np.nonzero((grid.cells != OCCUPIED) & (cells == OCCUPIED))
+        filled = np.stack([column, row], axis=1)
+        row, column = np.nonzero(occupied)
+        return _Change(0.0, freed, filled, np.stack([column, row], axis=1))
+
+    def _painted(self, key: PartKey, grid: OccupancyGrid, cells: NDArray[np.uint8]) -> int:
+        """Paint new obstacles onto the open cells: how many."""
+        import cv2
+
+        rng = self.draw(f"obstacles/{key.name}")
+        spots = _open(cells, self.options.obstacle_size[1] / grid.resolution)
+        done, count = 0, self._many(self.options.obstacles)
+        for _ in range(count if len(spots) else 0):
+            shape, yaw, _, _ = self._body(rng)
+            for _ in range(TRIES):
+                row, column = divmod(int(spots[int(rng.integers(len(spots)))]), grid.width)
+                at = shapely.get_coordinates(_moved(shape, (0.0, 0.0), (0.0, 0.0, yaw)))[:-1] / grid.resolution
+                reach = int(np.ceil(np.abs(at).max())) + 1
+                spot = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
+                cv2.fillPoly(spot, [np.round(at + reach).astype(np.int32)], 1)
+                into = _window(cells, column - reach, row - reach, 2 * reach + 1, 2 * reach + 1)
+                if into is not None and (cells[into][spot == 1] == FREE).all():
+                    cells[into][spot == 1] = OCCUPIED
+                    done += 1
+                    break
+        if done < count:
+            self.notes.drop("new obstacles", count - done, f"there is no room for them on {self.level}")
+        return done
+
+    # --- the network -------------------------------------------------------------------------------------------------
+    def _network(self, change: _Change, main: OccupancyGrid | None) -> tuple[dict[PartKey, Part], list[Any]]:
+        """The parts of the network that change, and the lines (metres) that robots still take."""
+        out: dict[PartKey, Part] = {}
+        kept: list[Any] = []
+        boxes, old = (_squares(places, change.size, main) for places in (change.filled, change.before))
+        tree, was = shapely.STRtree(boxes), shapely.STRtree(old)
+        for key, part in self.lines.items():
+            metres = shapely.force_2d(part.in_local(self.given.frame))
+            hit = _nearest(tree, metres, self.options.robot_radius) < self._reach(was, metres)
+            edge = np.array([p.get("kind") == "edge" for p in part.properties])
+            kept += [g for g, e, h in zip(metres, edge, hit, strict=True) if e and not h and not g.is_empty]
+            crossed = [part.ids[k] for k in np.flatnonzero(hit & edge)]
+            covered = [part.ids[k] for k in np.flatnonzero(hit & ~edge)]
+            if not crossed and not covered:
+                continue
+            if self.options.edges == "block":
+                said = tuple(
+                    {**p, "blocked": True} if h and e else p for p, h, e in zip(part.properties, hit, edge, strict=True)
+                )
+                if crossed:
+                    out[key] = Features(part.ids, part.geometry.copy(), said, part.local.copy(), part.document)
+                self._warn("blocked", crossed, key)
+                self._warn("under an obstacle", covered, key, "nodes")
+            else:
+                out[key] = part.take(~hit)
+                self._warn("removed", crossed, key)
+                self._warn("removed", covered, key, "nodes")
+        return out, kept
+
+    def _reach(self, was: shapely.STRtree, metres: NDArray[np.object_]) -> Array:
+        """How near an obstacle may come to each line or point: the robot's radius; where one was nearer before, so that
+        a smaller robot is meant, half of that distance."""
+        radius = self.options.robot_radius
+        away = _nearest(was, metres, radius)
+        return np.where(away < radius, away / 2, np.nextafter(radius, np.inf))
+
+    def _warn(self, what: str, ids: Sequence[str], key: PartKey, kind: str = "edges") -> None:
+        if ids:
+            some = ", ".join(ids[:10]) + (" …" if len(ids) > 10 else "")
+            where = f"{key.level}/{key.name}"
+            self.notes.warn(f"{len(ids)} {kind} are {what}, since an obstacle now stands there: {some}", where=where)
+
+    # --- noise -------------------------------------------------------------------------------------------------------
+    def _noise(
+        self, key: PartKey, grid: OccupancyGrid, cells: NDArray[np.uint8], lines: Sequence[Any]
+    ) -> NDArray[np.uint8]:
+        """Cells as a sensor that errs sees them."""
+        known = cells != UNKNOWN
+        down, across = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+        if not len(down):
+            return cells
+        y0, x0 = int(down[0]), int(across[0])
+        inner = (slice(y0, int(down[-1]) + 1), slice(x0, int(across[-1]) + 1))  # most of many a map is unknown
+        out = cells.copy()
+        out[inner] = self._errors(key, grid, cells[inner], (x0, y0), lines)
+        return out
+
+    def _errors(
+        self, key: PartKey, grid: OccupancyGrid, cells: NDArray[np.uint8], first: tuple[int, int], lines: Sequence[Any]
+    ) -> NDArray[np.uint8]:
+        """The same of a window of the grid. first: its first column and row."""
+        import cv2
+
+        options, s = self.options, self.options.severity
+        out = cells.copy()
+        free, occupied = cells == FREE, cells == OCCUPIED
+        driven = np.zeros(cells.shape, np.uint8)
+        for line in lines:
+            at = np.round(_columns(grid, shapely.get_coordinates(line)) - 0.5) - first
+            if np.abs(at).max(initial=0.0) < 2**24:  # cv2 takes 32-bit places; what lies far off is in no grid
+                cv2.polylines(driven, [at.astype(np.int32)], False, 1)
+        if not driven.any():
+            away = cv2.distanceTransform(np.pad(free, 1).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+            driven.reshape(-1)[int(np.argmax(away[1:-1, 1:-1]))] = 1
+            near = np.zeros(cells.shape, bool)
+            away = cv2.distanceTransform(1 - driven, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        else:
+            away = cv2.distanceTransform(1 - driven, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+            near = away <= options.robot_radius / grid.resolution + 2.0
+        # In 64 steps, so that no last bit of a distance decides.
+        weight = np.floor(np.minimum(away * (grid.resolution / options.sensor_range), 1.0) * 64) / 64
+        kernel = np.ones((3, 3), np.uint8)
+        rng = self.draw(f"noise/{key.name}")
+        chance = rng.random(cells.shape, np.float32)
+        worn = occupied & (cv2.dilate(free.astype(np.uint8), kernel) == 1)
+        beside = free & (cv2.dilate(occupied.astype(np.uint8), kernel) == 1)
+        share = (0.5 + 0.5 * weight).astype(np.float32)
+        out[worn & (chance < min(options.erode * s, 1.0) * share)] = FREE
+        out[beside & ~near & (chance < min(options.dilate * s, 1.0) * share)] = OCCUPIED
+        out[free & ~beside & ~near & (chance < min(options.speckle * s, 1.0) * weight)] = OCCUPIED
+        known = np.flatnonzero((cells != UNKNOWN) & ~near)
+        for _ in range(self._many(options.dropped) if len(known) else 0):
+            row, column = divmod(int(known[int(rng.integers(len(known)))]), cells.shape[1])
+            radius = max(1, round(options.patch / 2 / grid.resolution * (0.3 + 0.7 * float(rng.random()))))
+            y0, x0 = max(0, row - radius), max(0, column - radius)
+            hole = (slice(y0, row + radius + 1), slice(x0, column + radius + 1))
+            down = np.arange(hole[0].start, min(hole[0].stop, cells.shape[0]))[:, None] - row
+            across = np.arange(hole[1].start, min(hole[1].stop, cells.shape[1]))[None] - column
+            out[hole][(down**2 + across**2 <= radius**2) & ~near[hole]] = UNKNOWN
+        return out
+
+
+# --- the network as a whole -------------------------------------------------------------------------------------------
+def _without_lost(given: Layers, parts: dict[PartKey, Part], notes: Notes) -> dict[PartKey, Part]:
+    """Without edges whose nodes are gone, on whatever level they are; with a word on what hangs together no more."""
+    before = given.vector("topology")
+    after: dict[PartKey, Features] = {}
+    for key, part in before.items():
+        new = parts.get(key, part)
+        assert isinstance(new, Features)
+        after[key] = new
+    if all(after[k] is p for k, p in before.items()):
+        return {}
+    gone = {i for p in before.values() for i in p.ids} - {i for p in after.values() for i in p.ids}
+    out: dict[PartKey, Part] = {}
+    for key, part in after.items():
+        lost = [
+            p.get("kind") == "edge" and (p.get("source") in gone or p.get("target") in gone) for p in part.properties
+        ]
+        if any(lost):
+            notes.drop("edges", sum(lost), "an obstacle stands where they lead from or to")
+            after[key] = part.take(~np.array(lost))
+        if after[key] is not before[key]:
+            out[key] = after[key]
+    used = {
+        p[end] for f in before.values() for p in f.properties if p.get("kind") == "edge" for end in ("source", "target")
+    }
+    was, now = (_connected(list(f.values()), used - gone) for f in (before, after))
+    if now > was:
+        notes.warn(f"the network falls into {now} pieces, and was in {was}")
+    return out
+
+
+def _connected(collections: Sequence[Features], nodes: set[str]) -> int:
+    """In how many pieces these nodes of a network are."""
+    from scipy.sparse import coo_matrix  # type: ignore[import-untyped]
+    from scipy.sparse.csgraph import connected_components  # type: ignore[import-untyped]
+
+    number = {i: k for k, i in enumerate(sorted(nodes))}
+    said = [p for f in collections for p in f.properties if p.get("kind") == "edge"]
+    ends = [(number[p["source"]], number[p["target"]]) for p in said if p["source"] in number and p["target"] in number]
+    if not nodes:
+        return 0
+    a, b = np.array(ends, np.int64).reshape(-1, 2).T
+    graph = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(len(nodes),) * 2)
+    return int(connected_components(graph, directed=False)[0])
+
+
+# --- objects ----------------------------------------------------------------------------------------------------------
+def _moved(shape: Any, around: tuple[float, float], by: tuple[float, float, float]) -> Any:
+    """A shape turned around a point and shifted, in whole millimetres; heights stay."""
+    dx, dy, turn = by
+    c, s = math.cos(turn), math.sin(turn)
+    x, y = around
+
+    def placed(at: Array) -> Array:
+        u, v = at[:, 0] - x, at[:, 1] - y
+        flat = np.stack([x + c * u - s * v + dx, y + s * u + c * v + dy], axis=1)
+        return np.asarray(np.concatenate([np.round(flat, 3) + 0.0, at[:, 2:]], axis=1), np.float64)
+
+    return shapely.transform(shape, placed, include_z=bool(shapely.has_z(shape)))
+
+
+def _changed(part: Features, things: dict[int, _Thing], given: Layers) -> Features:
+    """A part with its objects where they are now, and without those that are gone."""
+    metres = part.in_local(given.frame).copy()
+    geometry = part.geometry.copy()
+    properties = list(part.properties)
+    for k, t in things.items():
+        if t.gone or t.moved is None:
+            continue
+        metres[k] = _moved(metres[k], t.at, t.moved)
+        if part.local[k]:
+            geometry[k] = metres[k]
+        else:
+            assert given.frame is not None
+            back = given.frame.geometries_to_wgs84(np.array([metres[k]], object))
+            geometry[k] = shapely.set_precision(back[0], 1e-12, mode="pointwise")
+        said = properties[k]
+        if said.get("pose") is not None or said.get("shapes"):
+            pose = list(solids.pose_of(said))
+            place = shapely.get_coordinates(_moved(shapely.Point(pose[:2]), t.at, t.moved))[0].tolist()
+            yaw = round(math.remainder(pose[5] + t.moved[2], math.tau), 6) + 0.0
+            properties[k] = {**said, "pose": [*place, pose[2], pose[3], pose[4], yaw]}
+    stays = np.array([k not in things or not things[k].gone for k in range(len(part))], bool)
+    return Features(part.ids, geometry, tuple(properties), part.local.copy(), part.document).take(stays)
+
+
+def _joined(before: Features | None, rows: list[tuple[str, Any, dict[str, Any]]]) -> Features:
+    """New rows behind what is there."""
+    fresh = features(rows, "local")
+    if before is None:
+        return fresh
+    geometry = np.concatenate([before.geometry, fresh.geometry])
+    local = np.concatenate([before.local, fresh.local])
+    said = (*before.properties, *fresh.properties)
+    return Features((*before.ids, *fresh.ids), geometry, said, local, before.document)
+
+
+def _rows(at: Array) -> NDArray[np.int64]:
+    """The row of each of the places [n, 2], from 0; -1: it is in none.
+
+    Rows run in the direction in which most things have their nearest neighbour; a row ends sideways where there is a
+    gap of more than half the usual distance to it.
+    """
+    from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+
+    out = np.full(len(at), -1, np.int64)
+    if len(at) < ROW:
+        return out
+    away, which = cKDTree(at).query(at, 2)
+    apart = away[:, 1]
+    there = apart > 1e-6
+    if there.sum() < ROW:
+        return out
+    to = at[which[:, 1]] - at
+    angle = np.round(np.arctan2(to[:, 1], to[:, 0]) % math.pi, 6)
+    bins = np.bincount((angle[there] / math.pi * 36).astype(np.int64) % 36, minlength=36)
+    smooth = bins + np.roll(bins, 1) + np.roll(bins, -1)
+    best = int(np.argmax(smooth))
+    if smooth[best] < max(ROW, 0.4 * there.sum()):
+        return out
+    # The mean of directions that are 180 degrees apart is half the mean of their doubles.
+    close = there & (np.abs((angle / math.pi * 36 - best - 0.5 + 18) % 36 - 18) <= 1.5)
+    double = 2 * angle[close]
+    way = math.atan2(float(np.sin(double).sum()), float(np.cos(double).sum())) / 2
+    across = np.round(-math.sin(way) * at[:, 0] + math.cos(way) * at[:, 1], 3)
+    gap = max(float(np.median(apart[there])) / 2, 0.05)
+    order = np.argsort(across, kind="stable")
+    row = np.empty(len(at), np.int64)
+    row[order] = np.concatenate([[0], np.cumsum(np.diff(across[order]) > gap)])
+    count = np.bincount(row)
+    numbers = np.cumsum(count >= ROW) - 1
+    return np.where(count[row] >= ROW, numbers[row], -1)
+
+
+def _apart(things: Sequence[_Thing]) -> int:
+    """Put back what has come to stand in others and did not before: how many things."""
+    there = [t for t in things if not t.gone]
+    before = np.array([t.body for t in there], object)
+    put = 0
+    while True:
+        now = np.array([t.now() for t in there], object)
+        a, b = shapely.STRtree(now).query(now, predicate="intersects")
+        pair = a < b
+        a, b = a[pair], b[pair]
+        moved = np.array([t.moved is not None and any(t.moved) for t in there], bool)
+        wrong = (moved[a] | moved[b]) & ~shapely.intersects(before[a], before[b])
+        if not wrong.any():
+            return put
+        for k in np.unique(np.concatenate([a[wrong], b[wrong]])).tolist():
+            if moved[k]:
+                there[k].moved = (0.0, 0.0, 0.0)
+                put += 1
+
+
+# --- cells ------------------------------------------------------------------------------------------------------------
+_BIAS, _SPAN = 2**30, 2**31
+
+
+def _occupied(grid: OccupancyGrid) -> Cells:
+    """The occupied cells of a derived grid (yaw 0, origin a multiple of the resolution) as sorted numbers."""
+    row, column = np.nonzero(grid.cells == OCCUPIED)
+    x, y = (round(v / grid.resolution) for v in grid.origin[:2])
+    return np.sort(_numbers(np.stack([column + x, row + y], axis=1)))
+
+
+def _numbers(places: Cells) -> Cells:
+    """Each square (column, row) as one number."""
+    return (places[:, 0].astype(np.int64) + _BIAS) * _SPAN + (places[:, 1].astype(np.int64) + _BIAS)
+
+
+def _places(numbers: Cells) -> Cells:
+    return np.stack([numbers // _SPAN - _BIAS, numbers % _SPAN - _BIAS], axis=1)
+
+
+def _metres(grid: OccupancyGrid, at: Array) -> Array:
+    """Places in a grid, in columns and rows, as metres."""
+    x, y, yaw = grid.origin
+    c, s = math.cos(yaw), math.sin(yaw)
+    u, v = at[:, 0] * grid.resolution, at[:, 1] * grid.resolution
+    return np.stack([x + c * u - s * v, y + s * u + c * v], axis=1)
+
+
+def _columns(grid: OccupancyGrid, at: Array) -> Array:
+    """Metres as columns and rows of a grid."""
+    x, y, yaw = grid.origin
+    c, s = math.cos(yaw), math.sin(yaw)
+    u, v = at[:, 0] - x, at[:, 1] - y
+    return np.stack([c * u + s * v, -s * u + c * v], axis=1) / grid.resolution
+
+
+def _applied(grid: OccupancyGrid, change: _Change) -> NDArray[np.uint8]:
+    """The cells with what the obstacles left free and what they cover now."""
+    cells = grid.cells.copy()
+    for places, value in ((change.freed, FREE), (change.filled, OCCUPIED)):
+        at = _cells_of(grid, change, places)
+        inside = ((at >= 0) & (at < [grid.width, grid.height])).all(axis=1)
+        column, row = at[inside].T
+        if value == FREE:
+            known = cells[row, column] == OCCUPIED
+            column, row = column[known], row[known]
+        cells[row, column] = value
+    return cells
+
+
+def _cells_of(grid: OccupancyGrid, change: _Change, places: Cells) -> Cells:
+    """The cells of a grid that squares lie in; ``size`` 0: they are its own."""
+    if change.size == 0.0 or not len(places):
+        return places
+    offset = np.array(grid.origin[:2]) / change.size
+    if grid.origin[2] == 0.0 and grid.resolution == change.size and (np.abs(offset - np.round(offset)) < 1e-6).all():
+        return places - np.round(offset).astype(np.int64)
+    # Of the cells that the squares reach into those whose middle lies in one.
+    steps = max(2, math.ceil(2 * change.size / grid.resolution))
+    inner = (np.arange(steps) + 0.5) / steps
+    spread = np.stack(np.meshgrid(inner, inner), axis=-1).reshape(-1, 2)
+    at = ((places[:, None, :] + spread[None]) * change.size).reshape(-1, 2)
+    reached = np.unique(np.floor(_columns(grid, at) + 1e-9).astype(np.int64), axis=0)
+    middles = np.floor(_metres(grid, np.asarray(reached + 0.5, np.float64)) / change.size + 1e-9).astype(np.int64)
+    return reached[np.isin(_numbers(middles), _numbers(places))]
+
+
+def _nearest(tree: shapely.STRtree, metres: NDArray[np.object_], most: float) -> Array:
+    """Metres from each geometry to the nearest of the tree's; infinite beyond ``most``."""
+    out = np.full(len(metres), np.inf)
+    usable = np.flatnonzero(~shapely.is_empty(metres))
+    if len(usable) and len(tree.geometries) and most > 0:
+        at, away = tree.query_nearest(metres[usable], max_distance=most, return_distance=True, all_matches=False)
+        out[usable[at[0]]] = np.round(away, 6)
+    elif len(usable) and len(tree.geometries):
+        out[usable[np.unique(tree.query(metres[usable], predicate="intersects")[0])]] = 0.0
+    return out
+
+
+def _squares(places: Cells, size: float, main: OccupancyGrid | None) -> NDArray[np.object_]:
+    """Squares as boxes of consecutive ones, in metres. size 0: they are cells of the grid."""
+    if not len(places):
+        return np.empty(0, object)
+    order = np.lexsort((places[:, 0], places[:, 1]))
+    at = places[order]
+    new = np.ones(len(at), bool)
+    new[1:] = (at[1:, 1] != at[:-1, 1]) | (at[1:, 0] != at[:-1, 0] + 1)
+    first = at[new]
+    last = at[np.concatenate([np.flatnonzero(new)[1:] - 1, [len(at) - 1]])]
+    boxes = shapely.box(first[:, 0], first[:, 1], last[:, 0] + 1, last[:, 1] + 1)
+    if size > 0.0:
+        return np.asarray(shapely.transform(boxes, lambda xy: xy * size), object)
+    assert main is not None
+    return np.asarray(shapely.transform(boxes, lambda xy: _metres(main, xy)), object)
+
+
+def _open(cells: NDArray[np.uint8], across: float) -> Cells:
+    """The cells around which it is free as far as half of a thing so large reaches: their numbers."""
+    import cv2
+
+    free = cells == FREE
+    down, over = np.flatnonzero(free.any(axis=1)), np.flatnonzero(free.any(axis=0))
+    if not len(down):
+        return np.empty(0, np.int64)
+    y, x = int(down[0]), int(over[0])
+    inner = np.pad(free[y : int(down[-1]) + 1, x : int(over[-1]) + 1], 1).astype(np.uint8)
+    away = cv2.distanceTransform(inner, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    row, column = np.nonzero(np.round(away, 3) > across * 0.75 + 1)
+    return np.asarray((row + y) * cells.shape[1] + column + x, np.int64)
+
+
+def _window(cells: NDArray[np.uint8], x: int, y: int, w: int, h: int) -> tuple[slice, slice] | None:
+    """A window of the grid; None where it reaches beyond."""
+    if x < 0 or y < 0 or x + w > cells.shape[1] or y + h > cells.shape[0]:
+        return None
+    return slice(y, y + h), slice(x, x + w)
+
+
+def _ring(radius: float) -> Any:
+    return shapely.transform(shapely.Point(0, 0).buffer(radius, quad_segs=4), lambda xy: np.round(xy, 3) + 0.0)
