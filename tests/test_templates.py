@@ -5,7 +5,13 @@ from __future__ import annotations
 import pytest
 
 from app import formats, parameters, templates
+from app.bundle import Hints
+from app.convert import offline
 from app.errors import Invalid
+from app.formats import Group, ReadContext
+from app.model.features import Features
+from app.model.frame import Datum
+from app.model.layers import Layers
 from app.model.templates import NO_TEMPLATES, Own, Templates, template_changes
 
 TMAP2 = formats.get_format("tmap2")
@@ -75,3 +81,34 @@ def test_values_are_typed_as_json_has_them() -> None:
     with pytest.raises(Invalid) as caught:
         templates.check_values(TMAP2, {"xy_goal_tolerance": -1, "colour": 2})
     assert {p.where for p in caught.value.problems} == {"values.xy_goal_tolerance", "values.colour"}
+
+
+EVIL = "\"'<&>: {[#%!]} ]]>--\\ äß"
+LANE = b"""<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>lanes</name><Placemark><name>Lane</name>
+<LineString><coordinates>-0.5245,53.2686 -0.5244,53.2686 -0.5244,53.2687</coordinates></LineString></Placemark>
+</Document></kml>"""
+
+
+def texts(known: formats.Format) -> dict[str, str]:
+    """The parameters of a writer that take any text and choose no stored part."""
+    choosing = {"grid", "level", "name", "picture", "world"}
+    described = parameters.describe(known.write_options)
+    return {p["name"]: EVIL for p in described if p["schema"] == {"type": "string"} and p["name"] not in choosing}
+
+
+SAYING = [known.name for known in formats.all_formats().values() if texts(known)]
+
+
+@pytest.mark.parametrize("name", SAYING)
+def test_no_text_breaks_out_of_a_file(name: str) -> None:
+    known = formats.get_format(name)
+    said = templates.check_values(known, texts(known))
+    hints, here = Hints(layer="topology"), Datum(53.2686, -0.5245)
+    made = offline({"lanes.kml": LANE}, name, hints=hints, datum=here, options=said)
+    main = next(iter(made.files))
+    back = formats.read(Group(known, main, made.files), ReadContext(frame=Layers({}, here).frame))
+    whole = str([(p.ids, p.properties, p.document) for p in back.parts.values() if isinstance(p, Features)])
+    filled = {line["option"] for line in made.report["template"] if line.get("option") in said}
+    assert filled
+    assert {line["from"] for line in made.report["template"] if line.get("option") in filled} == {"request"}
+    assert whole.count(repr(EVIL)[1:-1]) >= 1, "it came through as a text, whole"

@@ -60,16 +60,20 @@ def test_the_whole_way(api: Api) -> None:
     assert api.get("environments?bbox=10,10,11,11").json() == []
     api("PUT", "environments/farm/channels/production", 200, json={"version": 1})
     assert api.get("/maps/farm/tmap2").headers["etag"] == first.headers["etag"]
+    said = {"set": "outdoor", "formats": {"tmap2": {"values": {"pointset": "rows"}}}}
+    assert api("PUT", "environments/farm/templates", 201, json=said).json()["version"] == 3
+    assert b"pointset: rows" in api.get("environments/farm/versions/latest/maps/tmap2").content
+    assert api.get("environments/farm/versions/2/maps/tmap2").headers["etag"] == second.headers["etag"]
     api.post("environments/farm/versions", {"revert_to": 1})
     assert (
-        api.get("environments/farm/versions/3").json()["root"] == api.get("environments/farm/versions/1").json()["root"]
+        api.get("environments/farm/versions/4").json()["root"] == api.get("environments/farm/versions/1").json()["root"]
     )
     assert api.get("environments/farm/versions/1/sources/n.tmap2.yaml").content == samples.tmap2()
     viewer = api.token_for("viewer", environments="farm")
     viewer.get("/maps/farm/kml")
     viewer.problem("DELETE", "environments/farm", 403)
     api.post("environments", {"name": "copy", "clone": {"environment": "farm"}})
-    assert 'fleetmap_head{environment="farm"} 3.0' in api.get("/metrics").text
+    assert 'fleetmap_head{environment="farm"} 4.0' in api.get("/metrics").text
     api("DELETE", "environments/farm", 204)
     api.problem("GET", "/maps/farm/tmap2", 404)
     api.post("environments/farm/purge", expect=204)

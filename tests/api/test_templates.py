@@ -49,9 +49,16 @@ def etag(api: Api, env: str, format: str = "tmap2", version: Any = "latest", que
     return str(api.get(f"environments/{env}/versions/{version}/maps/{format}{query}").headers["etag"])
 
 
+def files(api: Api, env: str, version: Any = "latest") -> dict[str, str]:
+    """The hashes of a signed manifest, by format."""
+    told = api.get(f"environments/{env}/versions/{version}/manifest?formats=tmap2,kml").json()
+    return {file["format"]: file["sha256"] for file in told["files"]}
+
+
 def test_values_of_an_environment_are_a_version_and_robots_get_them(api: Api, env: str) -> None:
     assert filled(api, env)["xy_goal_tolerance"] == (0.3, "default")
     before, kml = etag(api, env), etag(api, env, "kml")
+    listed = files(api, env)
     made = put(api, env, "/tmap2", values={"xy_goal_tolerance": 0.4, "action": "NavigateToPose"}, message="for ROS 2")
     assert (made["version"], made["parent"], made["message"]) == (3, 2, "for ROS 2")
     old = api.get(f"environments/{env}/versions/2").json()
@@ -69,6 +76,10 @@ def test_values_of_an_environment_are_a_version_and_robots_get_them(api: Api, en
     assert api.get(f"/maps/{env}/tmap2").content.count(b"action: NavigateToPose") == 4
     assert etag(api, env) != before
     assert etag(api, env, "kml") == kml, "other maps stay as they are"
+    after = files(api, env)
+    assert after["kml"] == listed["kml"]
+    assert after["tmap2"] != listed["tmap2"], "what robots verify is what they get"
+    assert files(api, env, 2) == listed
     assert (tolerance(api, env, 2), etag(api, env, version=2)) == (0.3, before), "old versions, too"
     said = filled(api, env)
     assert said["xy_goal_tolerance"] == (0.4, "environment")
