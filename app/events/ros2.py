@@ -191,6 +191,7 @@ class Ros2:
                     if self._lock is None:
                         self._ending.wait(POLL_SECONDS)
                         continue
+                    self._note({"state": "starting"})  # what a process said that was killed no longer holds
                 self._round()
             except FleetMapError as error:
                 self._note({"state": "down", "detail": error.detail})
@@ -326,7 +327,7 @@ class Ros2:
         """Tell the log when it changes, and all workers by a file."""
         if state == self._told:
             return
-        if state["state"] != self._told.get("state") and state["state"] != "connected":
+        if state["state"] == "down" != self._told.get("state"):
             log.error("NOTHING GOES OUT TO ROS 2: %s", state.get("detail", ""))
         self._told = state
         path = self._data_dir / STATE_FILE

@@ -26,7 +26,7 @@ from zenoh import ext
 from app.errors import Unavailable
 from app.events import cdr, ros_names
 from app.events.bus import BusOptions, router_configuration
-from app.events.ros2 import Content, Ros2, Ros2Options
+from app.events.ros2 import Content, Ros2, Ros2Options, state_of
 from app.events.ros_names import Chosen
 from app.events.router import Router
 from tests.api import samples
@@ -469,6 +469,7 @@ def test_what_cannot_be_had_leaves_the_last_map_and_is_tried_again(
     monkeypatch.setattr("app.events.ros2.ASK_SECONDS", 0.1)
     where, port = router
     state = {"root": "a", "fails": 0, "calls": 0}
+    (tmp_path / "ros2.json").write_text('{"state": "connected", "topics": 99}')  # of a process that was killed
 
     def fetch(asked: Any) -> Content:
         state["calls"] += 1
@@ -490,11 +491,38 @@ def test_what_cannot_be_had_leaves_the_last_map_and_is_tried_again(
         with zenoh.open(client_config(port)) as session:
             heard = Heard(session, "map")
             assert grid_of(heard.wait(1))["cells"][1, 2] == ord("a")
+            eventually(lambda: state_of(tmp_path) == {"state": "connected", "topics": 2})
             state["fails"], state["root"] = 2, "b"
             assert grid_of(heard.wait(2))["cells"][1, 2] == ord("b")
             assert caplog.text.count("the pool is busy") == 2
             assert state["calls"] == 4, "what stands is not fetched again"
             assert grid_of(Heard(session, "map").wait())["cells"][1, 2] == ord("b")
+    finally:
+        publishing.close()
+
+
+def test_without_a_router_it_is_told_and_found_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.events.bus.CONNECT_SECONDS", 0.3)
+    port = free_port()
+    where = f"tcp/127.0.0.1:{port}"
+    publishing = Ros2(
+        Ros2Options((Chosen("farm", "/"),), ("ros2dds",)),
+        BusOptions(mode="client", connect=where),
+        tmp_path,
+        generation=lambda: 0,
+        look=lambda: {"farm": version("farm", "r")},
+        fetch=lambda _: Content({None: SMALL}, None),
+    )
+    publishing.start()
+    try:
+        eventually(lambda: state_of(tmp_path)["state"] == "down")
+        assert "no router" in state_of(tmp_path)["detail"]
+        made = Router(router_configuration(BusOptions(listen=where)))
+        try:
+            with zenoh.open(client_config(port)) as session:
+                assert grid_of(Heard(session, "map").wait())["resolution"] == 0.5
+        finally:
+            made.close()
     finally:
         publishing.close()
 
