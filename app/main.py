@@ -99,6 +99,7 @@ def create_app(settings: Settings) -> Server:
         here = await run_in_threadpool(open_services, settings)
         app.state.services = here
         app.state.feed = events.Feed(here)
+        here.fleet.start()
         publishing = [p for p in (ros2_of(settings, here), relay_of(settings, here)) if p is not None]
         app.hot = here.hot
         ticker = asyncio.create_task(_tick(here))
@@ -320,7 +321,6 @@ def relay_of(settings: Settings, here: Services) -> Relay | None:
     options = _bus_options(settings)
     made = Bus(options, ask=partial(events.ask, here), on_status=here.fleet.heard, on_alive=here.fleet.alive)
     relay = Relay(here.store, made, settings.data_dir)
-    here.fleet.start()
     relay.start()
     return relay
 

@@ -91,12 +91,12 @@ def robot_name(text: str | None = None) -> str:
 
 
 class Agent:
-    """One environment's map in one folder."""
+    """One environment's map in one folder. clock: seconds since 1970; it may be a minute off."""
 
-    def __init__(self, options: Options, tell: Tell) -> None:
+    def __init__(self, options: Options, tell: Tell, clock: Callable[[], float] = time.time) -> None:
         if options.key is not None:
             trust.check_given(options.key)
-        self.options, self._tell = options, tell
+        self.options, self._tell, self._clock = options, tell, clock
         self._robot = robot_name(options.robot)
         self._login = options.zenoh_login
         if self._login.password is not None and self._login.user is None:
@@ -334,7 +334,7 @@ class Agent:
         """The channel's manifest, believed; None where the installed one is still it."""
         asked = f"{channel}?{','.join(self.options.formats)}"
         state = self._state
-        current = state.asked == asked and state.etag is not None and state.expires > time.time()
+        current = state.asked == asked and state.etag is not None and state.expires > self._clock()
         fits = current and self._folder.standing is not None
         found = self._web.manifest(
             self.options.environment, channel, self.options.formats, state.etag if fits else None
@@ -362,6 +362,7 @@ class Agent:
             channel=channel,
             formats=self.options.formats,
             mark=mark,
+            now=datetime.fromtimestamp(self._clock(), UTC),
         )
         return manifest, key
 
@@ -512,7 +513,8 @@ class Agent:
             version, root = self._target
         channel = self._state.channel or self.options.channel or LATEST
         sequence = manifest.sequence if manifest else None
-        now = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        moment = datetime.fromtimestamp(self._clock(), UTC)
+        now = moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
         detail = detail[: messages.MAX_DETAIL] if detail else None
         status = RobotStatus(channel, version, root, state, detail, now, sequence)
         if _same(status, self._said):

@@ -127,7 +127,8 @@ class Web:
     def put_status(self, robot: str, body: Mapping[str, Any]) -> None:
         """Tell the robot's status."""
         with self._reach():
-            answer = self._http.put(f"{API}/robots/{quote(robot, safe='')}/status", json=dict(body))
+            path = f"{API}/robots/{quote(robot, safe='')}/status"
+            answer = self._http.put(path, json=dict(body), headers={"Prefer": "return=minimal"})
         if answer.status_code >= 300:
             raise self._refused(answer)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Header, Query, Request
 from starlette.responses import Response
 
 from app import fleet
@@ -71,14 +71,27 @@ def get_robot(
     return answer(body)
 
 
-@router.put("/{robot}/status", responses=told(RobotOut, 400, 404, 409, 415), summary="A robot says what it holds")
-def put_status(robot: RobotPath, body: StatusBody, here: Here, who: Reporter) -> Response:
+@router.put(
+    "/{robot}/status",
+    responses={**told(RobotOut, 400, 404, 409, 415, 503), 204: {"description": "Taken (`Prefer: return=minimal`)"}},
+    summary="A robot says what it holds",
+)
+def put_status(
+    robot: RobotPath,
+    body: StatusBody,
+    here: Here,
+    who: Reporter,
+    prefer: Annotated[str | None, Header(description="`return=minimal` (RFC 7240): 204 instead of the robot.")] = None,
+) -> Response:
     """The same as over Zenoh. A robot's token may tell of the robot that it names; editors may tell of any."""
     may_report(who, robot)
     who.enter(body.environment)
     if body.time is not None and body.time.tzinfo is None:
         raise Invalid("time needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="body.time")])
     report = Report(body.channel, body.version, body.root, body.state, body.detail, body.sequence, body.time)
+    if prefer is not None and prefer.strip().lower() == "return=minimal":
+        here.fleet.note(Heard(body.environment, robot, report, datetime.now(UTC)))
+        return Response(status_code=204, headers={"preference-applied": "return=minimal"})
     return answer(noted(here, body.environment, robot, report))
 
 
@@ -105,9 +118,7 @@ def may_report(who: Principal, robot: str) -> None:
 
 def noted(here: Services, environment: str, robot: str, report: Report) -> dict[str, Any]:
     """Store a report; the robot as it is now."""
-    (refused,) = here.store.note_reports([Heard(environment, robot, report, datetime.now(UTC))])
-    if refused is not None:
-        raise refused
+    here.fleet.note(Heard(environment, robot, report, datetime.now(UTC)))
     return _told(here, here.store.robots(environment, robot))[0]
 
 

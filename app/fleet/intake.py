@@ -1,4 +1,6 @@
-"""What robots say over the bus, into the store: in order, many in one transaction, also when the database was away."""
+"""What robots say, into the store: in order, many in one transaction; what came over the bus also when the database was
+away. A fleet that reports at once costs some transactions, not one for each robot.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +10,8 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from app.errors import FleetMapError, Invalid, Unavailable
@@ -26,6 +30,7 @@ BATCH = 100
 
 RENEW_SECONDS = 15.0
 RETRY_SECONDS = 1.0
+NOTE_SECONDS = 20.0
 MAX_PRESENT = 100_000
 
 
@@ -39,12 +44,20 @@ def report_of(status: RobotStatus) -> Report:
     return Report(status.channel, status.version, status.root, status.state, status.detail, status.sequence, said)
 
 
+@dataclass(frozen=True, slots=True)
+class _Said:
+    """A report that waits. told: who waits to be told whether it was taken, None for what came over the bus."""
+
+    heard: Heard
+    told: Future[FleetMapError | None] | None = None
+
+
 class Intake:
-    """Reports and liveliness from the bus. ``heard`` and ``alive`` return at once; a thread writes."""
+    """Reports and liveliness. ``heard`` and ``alive`` return at once, ``note`` when it is stored; a thread writes."""
 
     def __init__(self, store: Store, clock: Callable[[], datetime] = lambda: datetime.now(UTC)) -> None:
         self._store, self._clock = store, clock
-        self._queue: queue.Queue[tuple[str, str, bytes, datetime] | None] = queue.Queue(WAITING)
+        self._queue: queue.Queue[tuple[str, str, bytes, datetime] | _Said | None] = queue.Queue(WAITING)
         self._there: set[str] = set()
         self._gone: set[str] = set()
         self._new: set[str] = set()
@@ -54,7 +67,9 @@ class Intake:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Begin to write."""
+        """Begin to write; once."""
+        if self._thread is not None:
+            return
         self._thread = threading.Thread(target=self._run, name="fleetmap-fleet", daemon=True)
         self._thread.start()
 
@@ -72,6 +87,22 @@ class Intake:
             self._queue.put_nowait((environment, robot, payload, self._clock()))
         except queue.Full:
             self._lost += 1
+
+    def note(self, heard: Heard) -> None:
+        """A report that came over HTTP: blocks until it is stored. Raises what the store has against it."""
+        told: Future[FleetMapError | None] = Future()
+        if self._thread is None or self._ending.is_set():
+            raise Unavailable("the server is starting or stopping: try again in a few seconds")
+        try:
+            self._queue.put_nowait(_Said(heard, told))
+        except queue.Full:
+            raise Unavailable("too many reports of robots wait: try again in a few seconds") from None
+        try:
+            refused = told.result(NOTE_SECONDS)
+        except TimeoutError:
+            raise Unavailable("the report could not be stored in time: try again in a few seconds") from None
+        if refused is not None:
+            raise refused
 
     def alive(self, robot: str, there: bool) -> None:
         """A robot's session came or went."""
@@ -91,7 +122,7 @@ class Intake:
 
     def _run(self) -> None:
         renewed = time.monotonic()
-        batch: list[Heard] = []
+        batch: list[_Said] = []
         while True:
             batch += self._take(RENEW_SECONDS / 3 if not batch else 0.0, BATCH - len(batch))
             renew = time.monotonic() - renewed > RENEW_SECONDS
@@ -102,16 +133,21 @@ class Intake:
                 batch = []
             except Unavailable as error:
                 log.warning("reports of robots wait: %s", error.detail)
+                for said in batch:
+                    _tell(said, error)
+                batch = [said for said in batch if said.told is None]
                 if self._ending.wait(RETRY_SECONDS):
                     return
             except Exception:
                 log.exception("reports of robots could not be taken")
+                for said in batch:
+                    _tell(said, Unavailable("the server made a mistake; its log says where"))
                 batch = []
             if self._ending.is_set() and self._queue.empty():
                 return
 
-    def _take(self, seconds: float, most: int) -> list[Heard]:
-        out: list[Heard] = []
+    def _take(self, seconds: float, most: int) -> list[_Said]:
+        out: list[_Said] = []
         deadline = time.monotonic() + seconds
         while len(out) < most:
             try:
@@ -124,20 +160,22 @@ class Intake:
                 break
             if item is None:
                 break
-            found = _read(*item)
-            if found is not None:
-                out.append(found)
+            if isinstance(item, _Said):
+                out.append(item)
+            elif (found := _read(*item)) is not None:
+                out.append(_Said(found))
         if self._lost:
             log.error("%d reports of robots were left out: they come faster than they can be stored", self._lost)
             self._lost = 0
         return out
 
-    def _write(self, batch: list[Heard]) -> None:
+    def _write(self, batch: list[_Said]) -> None:
         if not batch:
             return
-        for heard, refused in zip(batch, self._store.note_reports(batch), strict=True):
-            if refused is not None:
-                log.warning("a report of %s was left out: %s", heard.robot, refused.detail)
+        for said, refused in zip(batch, self._store.note_reports([said.heard for said in batch]), strict=True):
+            if refused is not None and said.told is None:
+                log.warning("a report of %s was left out: %s", said.heard.robot, refused.detail)
+            _tell(said, refused)
 
     def _write_presence(self, *, everybody: bool) -> None:
         with self._lock:
@@ -149,6 +187,11 @@ class Intake:
         with self._lock:
             self._new -= there
             self._gone -= gone
+
+
+def _tell(said: _Said, refused: FleetMapError | None) -> None:
+    if said.told is not None and not said.told.done():
+        said.told.set_result(refused)
 
 
 def _read(environment: str, robot: str, payload: bytes, time: datetime) -> Heard | None:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from typing import Any
 
+import httpx
 import pytest
 from backports import zstd
 from cryptography.exceptions import InvalidSignature
@@ -162,3 +166,28 @@ def test_without_a_known_dictionary_the_file_comes_whole(api: Api, farm: str, he
     assert answer.status_code == 200
     assert "content-encoding" not in answer.headers
     assert body == whole
+
+
+def test_a_fleet_that_asks_for_a_new_map_costs_one_conversion(api: Api, bare: str) -> None:
+    """40 robots at once, each for the manifest and the file."""
+    api.upload(bare, {"n.tmap2.yaml": samples.tmap2({"here": (0.5, 1.0), "there": (2.5, 1.0)}, (("here", "there"),))})
+
+    def made() -> float:
+        found = re.search(r'conversions_total\{format="tmap2",result="made"\} (\S+)', api.get("/metrics").text)
+        return float(found[1]) if found else 0.0
+
+    before = made()
+    start = threading.Barrier(40)
+
+    def ask(_: int) -> str:
+        start.wait(60)
+        with httpx.Client(base_url=api.url, headers=api.http.headers, timeout=60) as client:
+            place = f"/api/v1/environments/{bare}/versions"
+            (file,) = client.get(f"{place}/latest/manifest?formats=tmap2").json()["files"]
+            data = client.get(f"{place}/1/maps/tmap2/{file['name']}").content
+            assert hashlib.sha256(data).hexdigest() == file["sha256"]
+            return str(file["sha256"])
+
+    with ThreadPoolExecutor(40) as pool:
+        assert len(set(pool.map(ask, range(40)))) == 1
+    assert made() - before == 1

@@ -12,6 +12,7 @@ from app.main import open_services
 from app.store import Store
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
+from tests.api.test_writers import races
 from tests.postgres import postgres_cluster, postgres_url
 
 __all__ = ["postgres_cluster", "postgres_url"]
@@ -79,3 +80,9 @@ def test_the_whole_way(api: Api) -> None:
     api.post("environments/farm/purge", expect=204)
     assert [e["name"] for e in api.get("environments").json()] == ["copy"]
     assert api.get("/maps/copy/tmap2").content == first.content
+
+
+def test_writers_at_once(api: Api) -> None:
+    api.post("environments", {"name": "farm"})
+    api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
+    races(api, "farm")

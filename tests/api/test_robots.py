@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import pytest
+
+from app.errors import Unavailable
 from tests.api.conftest import Api
 
 
@@ -37,6 +41,39 @@ def test_a_robot_tells_its_status(api: Api, farm: str) -> None:
     assert api.get(f"robots?environment={farm}&channel=staging").json() == []
     api("PUT", f"environments/{farm}/channels/production", 200, json={"version": 2})
     assert api.get(f"robots/mower-1?environment={farm}").json()["lag"]["events"] == 0
+
+
+def test_many_reports_at_once_are_few_transactions(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, sizes = type(api.app.state.services.store), []
+    quick = store.note_reports
+
+    def counted(self: Any, heard: Any) -> Any:
+        sizes.append(len(heard))
+        time.sleep(0.2)
+        return quick(self, heard)
+
+    monkeypatch.setattr(store, "note_reports", counted)
+
+    def report(k: int) -> int:
+        body = status(farm if k else "nowhere", "a" * 64)
+        answer = api("PUT", f"robots/many-{k}/status", None, json=body, headers={"Prefer": "return=minimal"})
+        return answer.status_code
+
+    with ThreadPoolExecutor(24) as pool:
+        assert sorted(pool.map(report, range(24))) == [204] * 23 + [404], "each is told of his own"
+    assert sum(sizes) == 24
+    assert len(sizes) <= 12
+    assert len([r for r in api.get(f"robots?environment={farm}").json() if r["robot"].startswith("many-")]) == 23
+
+
+def test_a_report_that_cannot_be_stored_is_told(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def away(*_: Any) -> Any:
+        raise Unavailable("the database is away")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(api.app.state.services.store), "note_reports", away)
+        api.problem("PUT", "robots/late/status", 503, json=status(farm, "a" * 64))
+    api("PUT", "robots/late/status", 200, json=status(farm, "a" * 64))
 
 
 def test_the_list_comes_in_pages(api: Api, farm: str, bare: str) -> None:

@@ -1,0 +1,78 @@
+"""A robot whose clock is a minute off follows, switches at the server's time, and believes what has just expired."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.agent.core import Agent, Options
+from app.signing import Keys
+from tests.agent.conftest import Gate, network, whole
+from tests.agent.test_attacks import signed
+from tests.api.conftest import ADMIN, Api
+from tests.events.conftest import eventually
+
+Make = Callable[[float], Agent]
+
+
+@pytest.fixture
+def agent(place: str, gate: Gate, tmp_path: Path) -> Iterator[Make]:
+    """An agent in this process, whose clock is so many seconds fast."""
+    made: list[Agent] = []
+
+    def make(fast: float) -> Agent:
+        options = Options(gate.url, place, ("tmap2",), tmp_path / "robot", token=ADMIN, robot="robot")
+        one = Agent(options, lambda *_, **__: None, clock=lambda: time.time() + fast)
+        one.open()
+        made.append(one)
+        return one
+
+    yield make
+    for one in made:
+        one.close()
+
+
+@pytest.mark.parametrize("fast", [-60.0, 60.0])
+def test_activation_comes_at_the_servers_time(
+    api: Api, place: str, agent: Make, gate: Gate, tmp_path: Path, fast: float
+) -> None:
+    channel = f"environments/{place}/channels/production"
+    api("PUT", channel, 200, json={"version": 1})
+    one = agent(fast)
+    assert one.once()
+    api.upload(place, {"n.tmap2.yaml": network(1)})
+    at = datetime.now(UTC) + timedelta(seconds=4)
+    api("PUT", channel, 200, json={"version": 2, "activate_at": at.isoformat()})
+    assert one.once()
+    assert gate.statuses[-1]["state"] == "ready"
+    assert whole(tmp_path / "robot")["version"] == 1, "not by the robot's clock"
+    eventually(lambda: _stands(api, channel) == 2)
+    assert datetime.now(UTC) >= at
+    assert one.once()
+    assert whole(tmp_path / "robot")["version"] == 2
+    told = api.get(f"robots/robot?environment={place}").json()
+    assert told["online"]
+    assert told["lag"]["events"] == 0
+    own, heard = datetime.fromisoformat(told["time"]), datetime.fromisoformat(told["received"])
+    assert abs((own - heard).total_seconds() - fast) < 30, "the robot's clock shows, and decides nothing"
+
+
+def _stands(api: Api, channel: str) -> Any:
+    listed = api.get(channel.rpartition("/")[0]).json()
+    return next(c["version"] for c in listed if c["channel"] == "production")
+
+
+@pytest.mark.parametrize(("fast", "good"), [(-60.0, True), (50.0, True), (100.0, False)])
+def test_expiry_allows_for_a_minute(
+    place: str, agent: Make, gate: Gate, api: Api, folder: Path, tmp_path: Path, fast: float, good: bool
+) -> None:
+    api.get("keys")
+    soon = (datetime.now(UTC) + timedelta(seconds=20)).isoformat()
+    gate.change = signed(Keys(folder / "keys"), expires=soon)
+    assert agent(fast).once() is good
+    assert (tmp_path / "robot" / "current").exists() is good
