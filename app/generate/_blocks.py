@@ -43,7 +43,7 @@ from app.errors import CannotGenerate, Problem
 from app.generate import _expressions
 from app.generate._expressions import Expression, refuse
 
-MOST_SHAPES = 10_000
+MOST_SHAPES = 30_000
 DEEPEST = 48
 MOST_TEXT, MOST_RULES = 20_000, 200
 SMALLEST = 1.0

@@ -40,7 +40,7 @@ APRON = 5.0
 """Metres of paved ground before the entrance."""
 
 LOWEST = 2.4
-MAX_ROOMS = 2000
+MAX_ROOMS = 5000
 MAX_LEVELS = 20
 MARGIN = 2.0
 

@@ -47,7 +47,7 @@ from app.generate._expressions import Expression, refuse
 MOST_SYMBOLS = 100_000
 """Of a system at any time."""
 
-MOST_WORK = 1_000_000
+MOST_WORK = 2_500_000
 """Symbols that are rewritten, of all plants of one generation together."""
 
 MOST_DRAWN = 20_000

@@ -19,8 +19,9 @@ import shapely
 from shapely.ops import substring
 
 from app.derive import Notes
+from app.errors import CannotGenerate
 from app.generate._blocks import Street
-from app.generate._site import Site
+from app.generate._site import MOST_NODES, Site
 
 Point = tuple[float, float]
 
@@ -28,6 +29,9 @@ DANGLE = 0.4
 """Metres: pieces of a street beyond its last junction that are shorter come from rounding."""
 
 EXTEND = 0.05
+NODES = 8
+"""Nodes for each street between two junctions, about: ends of lanes and crossings, corners of blocks."""
+
 CORNER = math.radians(15.0)
 TOLERANCE = 1.0
 
@@ -75,7 +79,8 @@ def network_of(streets: Sequence[Street], walk: float) -> Streets:
     joined = shapely.line_merge(shapely.union_all(lines, grid_size=0.001))
     parts = [p for p in shapely.get_parts(joined) if p.geom_type == "LineString" and p.length > 0]
     parts = _trimmed(parts)
-    parts = [_shorter(part, _ends(parts)) for part in parts]
+    count = _ends(parts)
+    parts = [_shorter(part, count) for part in parts]
     parts.sort(key=lambda p: (p.bounds, p.length))
     tree = shapely.STRtree([s.line for s in streets])
     junctions: dict[Point, int] = {}
@@ -84,6 +89,11 @@ def network_of(streets: Sequence[Street], walk: float) -> Streets:
         nearest = int(tree.nearest(shapely.line_interpolate_point(part, 0.5, normalized=True)))
         ends = [junctions.setdefault(_at(c), len(junctions)) for c in (part.coords[0], part.coords[-1])]
         links.append(Link(part, streets[nearest].width, (ends[0], ends[1])))
+    if NODES * len(links) > MOST_NODES:
+        raise CannotGenerate(
+            f"the town has {len(links)} streets between junctions, and its network would have more than {MOST_NODES} "
+            "nodes: make it smaller, or its blocks larger"
+        )
     narrow = min((link.width for link in links), default=4 * walk)
     return Streets(links, list(junctions), min(walk, narrow / 4))
 

@@ -14,7 +14,7 @@ from app.derive import Notes
 from app.errors import CannotGenerate, Invalid, Problem
 from app.generate import Source, _blocks, _plants, _streets, generates
 from app.generate._blocks import Lot
-from app.generate._site import Site, SiteOptions, angle, disc, mm, refused
+from app.generate._site import SLACK, Site, SiteOptions, angle, disc, mm, refused
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -92,7 +92,7 @@ def town(given: Layers, options: Options, source: Source, notes: Notes) -> Layer
     if not made.streets:
         raise CannotGenerate("the rules make no street: use ring or cut", [Problem("no street", where="rules")])
     streets = _streets.network_of(made.streets, options.sidewalk)
-    need = options.robot_radius + 2 * site.resolution
+    need = options.robot_radius + SLACK * site.resolution
     if streets.walk / 2 < need:
         raise refused("sidewalk", f"{streets.walk:.2f} m are too narrow for the robot, which needs {2 * need:.2f} m")
     _paint(site, streets, made, boundary)
@@ -102,7 +102,7 @@ def town(given: Layers, options: Options, source: Source, notes: Notes) -> Layer
     roads = _streets.lanes(site, streets, 5.0, need)
     _streets.stop(site, streets, roads, notes)
     if options.lamps:
-        _lamps(site, streets, need)
+        _lamps(site, streets, need, notes)
     if options.trees:
         _green(site, [lot for lot in made.lots if lot.use in _blocks.OPEN], source)
     for k, lot in enumerate(lot for lot in made.lots if lot.use in ("park", "square")):
@@ -248,11 +248,15 @@ def _roof(ridge: float) -> Any:
     return np.array(faces, np.float64)
 
 
-def _lamps(site: Site, streets: _streets.Streets, need: float) -> None:
+def _lamps(site: Site, streets: _streets.Streets, need: float, notes: Notes) -> None:
     """Lamps at the kerb, where a robot still passes beside them."""
     off = streets.walk / 2 - 0.25
     if off - LAMP[0] < need:
+        notes.warn(
+            "there are no lamps: a robot would not pass beside them on the sidewalks, or not in cells of this size"
+        )
         return
+    roads = shapely.STRtree([shapely.buffer(link.line, streets.carriage(link) / 2) for link in streets.links])
     kept = shapely.STRtree([shapely.Point(at) for at in streets.kept])
     count = 0
     for loop in streets.loops:
@@ -263,8 +267,7 @@ def _lamps(site: Site, streets: _streets.Streets, need: float) -> None:
         for k in range(int(kerb.length / BETWEEN_LAMPS)):
             at = shapely.line_interpolate_point(kerb, (k + 0.5) * BETWEEN_LAMPS)
             near = kept.query(at, predicate="dwithin", distance=3.0)
-            roads = min(shapely.distance(at, link.line) - streets.carriage(link) / 2 for link in streets.links)
-            if len(near) or roads < 0.1:
+            if len(near) or len(roads.query(at, predicate="dwithin", distance=0.1)):
                 continue
             count += 1
             site.post(f"lamp_{count}", "pole", (mm(at.x), mm(at.y)), *LAMP, colour="metal", name=f"Lamp {count}")

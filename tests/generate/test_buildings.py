@@ -107,7 +107,7 @@ def test_inside_a_fence() -> None:
         ({"levels": 10**9}, "at most 20"),
         ({"length": 0}, "at least 4"),
         ({"length": 1e9}, "at most 500"),
-        ({"length": 500, "levels": 20, "room_width": (2.5, 3)}, "more than 2000 rooms"),
+        ({"length": 500, "levels": 20, "room_width": (2.5, 3)}, "more than 5000 rooms"),
         ({"room_width": (6, 3)}, "the smaller width comes first"),
         ({"room_width": (6, 6.1), "length": 32}, "no number of rooms"),
         ({"room_width": (2, 3)}, "for a door to stand in it"),

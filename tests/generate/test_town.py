@@ -118,8 +118,10 @@ def test_rules_that_lead_nowhere(rules: str, why: str) -> None:
         grown(rules)
 
 
-def test_a_grammar_that_explodes_is_stopped() -> None:
-    with pytest.raises(CannotGenerate, match="the rules make more than 10000 shapes"):
+def test_a_grammar_that_explodes_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert _blocks.MOST_SHAPES == 30_000
+    monkeypatch.setattr(_blocks, "MOST_SHAPES", 500)
+    with pytest.raises(CannotGenerate, match="the rules make more than 500 shapes"):
         grown("a -> cut(0.5, 0) a a", shapely.box(0, 0, 3000, 3000))
 
 
