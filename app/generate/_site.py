@@ -25,7 +25,8 @@ from app.derive._raster import Frame
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.errors import CannotConvert, CannotGenerate, Invalid, Problem
 from app.generate import MAX_CELLS, MAX_OBJECTS
-from app.model.features import Properties, features
+from app.model import solids
+from app.model.features import Features, Properties, features
 from app.model.frame import GROUND, Datum, Level
 from app.model.grid import FREE, UNKNOWN, OccupancyGrid
 from app.model.imagery import Picture
@@ -417,6 +418,9 @@ class Site:
         asked = Parameters(height=self.options.height, resolution=resolution)
         own = Notes()
         known = {k: p for k, p in parts.items() if k.layer != "location"}
+        for key, part in parts.items():
+            if isinstance(part, Features) and key.layer == "objects":
+                known[key] = self._near_slice(part, self.elevation(key.level) + self.options.height)
         known[PartKey("location", GROUND, SITE)] = features([("fence", self.fence, {"kind": "fence"})], "local")
         try:
             made = objects_to_occupancy(Layers(known, self.datum, self.levels), asked, own)
@@ -436,6 +440,26 @@ class Site:
                 cells, grid.resolution, grid.origin, properties=said
             )
         return out
+
+    def _near_slice(self, part: Features, z: float) -> Features:
+        """The objects without the solids that do not reach a height: crowns above a slice are most of a forest."""
+        known = solids.Solids(self.files)
+        radii: dict[str, float] = {}
+        kept: list[int] = []
+        said: list[Properties] = []
+        for k, p in enumerate(part.properties):
+            shapes = p.get("shapes")
+            if shapes:
+                base = p["pose"][2] if "pose" in p else 0.0
+                near = [shape for shape in shapes if _reaches(shape, z - base, known, radii)]
+                if not near:
+                    continue
+                said.append({**p, "shapes": near} if len(near) < len(shapes) else p)
+            else:
+                said.append(p)
+            kept.append(k)
+        index = np.array(kept, np.intp)
+        return Features(tuple(part.ids[k] for k in kept), part.geometry[index], tuple(said), part.local[index])
 
     def _checked_zones(self) -> None:
         """No edge leads through a keep-out zone."""
@@ -585,6 +609,24 @@ def _unreached(names: Sequence[str], ways: Iterable[tuple[str, str]]) -> list[st
                 seen.add(name)
                 waiting.append(name)
     return [name for name in names if name not in seen]
+
+
+def _reaches(shape: Mapping[str, Any], z: float, known: solids.Solids, radii: dict[str, float]) -> bool:
+    """Whether a shape may reach a height of its object's frame, whose z axis is upright: never False where it does."""
+    kind = shape["type"]
+    if kind == "box":
+        radius = math.hypot(*shape["size"]) / 2
+    elif kind in ("cylinder", "capsule"):
+        radius = math.hypot(shape["radius"], shape["length"] / 2) + (shape["radius"] if kind == "capsule" else 0.0)
+    elif kind == "mesh" and "center" not in shape:
+        if shape["file"] not in radii:
+            vertices = known.mesh(shape["file"]).vertices
+            radii[shape["file"]] = float(np.linalg.norm(vertices, axis=1).max())
+        radius = radii[shape["file"]] * max(map(abs, shape.get("scale", (1.0, 1.0, 1.0))))
+    else:
+        return True
+    middle = shape["pose"][2] if "pose" in shape else 0.0
+    return bool(abs(z - middle) <= radius + 0.001)
 
 
 def _listed(shape: Any) -> list[Any]:

@@ -16,7 +16,7 @@ from app.generate._site import Site, disc, mm, rgb
 CROWN = "models/crown/meshes/crown.stl"
 CROWNS = ("crown", "crown_light", "crown", "crown_dark")
 
-MOST_TREES = 60_000
+MOST_TREES = 40_000
 """A trunk and a crown have 144 triangles; ten millions are what a derivation looks at."""
 
 MOST_PLANTS = 50_000

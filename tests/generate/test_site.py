@@ -15,6 +15,8 @@ from app.errors import CannotGenerate, Invalid
 from app.formats import Group, ReadContext, WriteContext
 from app.generate import _site
 from app.generate._site import COLOURS, Site, SiteOptions
+from app.generate._trees import crown_mesh
+from app.model import solids
 from app.model.features import Features, features
 from app.model.frame import GROUND, Datum, Level
 from app.model.geodesy import local_frame
@@ -64,6 +66,24 @@ def test_the_grid_is_the_slice_of_the_written_world() -> None:
         Layers({**world.parts, **fence}, made.datum), Parameters(height=0.2, resolution=0.05), Notes()
     )
     assert (grid_of(again).cells == grid.cells).mean() >= 0.99
+
+
+def test_solids_that_do_not_reach_the_slice_are_not_looked_at() -> None:
+    upright = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    cylinder = {"type": "cylinder", "radius": 0.3, "length": 1.0, "pose": upright}
+    for shape, low, high in (
+        ({"type": "box", "size": [2.0, 2.0, 1.0], "pose": upright}, 0.5, 1.5),
+        (cylinder, 0.5, 1.5),
+        ({**cylinder, "type": "capsule"}, 0.2, 1.8),
+        ({"type": "mesh", "file": "crown.stl", "scale": [0.5, 0.5, 0.8], "pose": upright}, 0.2, 1.8),
+    ):
+        known = solids.Solids({"crown.stl": crown_mesh()})
+        made = known.triangles({"shapes": [shape]})
+        assert made[:, :, 2].min() == pytest.approx(low, abs=0.15)
+        assert all(_site._reaches(shape, z, known, {}) for z in np.linspace(low, high, 9))
+        assert not _site._reaches(shape, -1.0, known, {})
+        assert not _site._reaches(shape, 3.0, known, {})
+    assert _site._reaches({"type": "sphere", "radius": 1.0}, 99.0, solids.Solids({}), {}), "others are always looked at"
 
 
 def test_free_space_is_one_piece_and_the_rest_is_told() -> None:
