@@ -145,8 +145,7 @@ def _at(c: Iterable[float]) -> Point:
 def lanes(site: Site, streets: Streets, speed: float, keep: float) -> list[list[tuple[str, Any]]]:
     """Lanes and the ways through junctions. Of each link its lanes: (name of its first node, line).
 
-    keep: metres that ways through junctions stay away from kerbs; where the straight one does not, it leads over the
-    junction's middle.
+    keep: metres that ways through junctions stay away from kerbs.
     """
     inner = [
         shapely.buffer(link.line, max(0.05, streets.carriage(link) / 2 - keep), cap_style="square", join_style="mitre")
@@ -154,7 +153,7 @@ def lanes(site: Site, streets: Streets, speed: float, keep: float) -> list[list[
     ]
     roadway = shapely.union_all(inner)
     shapely.prepare(roadway)
-    ends: dict[str, Point] = {}
+    ends: dict[str, tuple[Point, Point]] = {}
     arriving: dict[int, list[tuple[str, int]]] = {}
     leaving: dict[int, list[tuple[str, int]]] = {}
     out: list[list[tuple[str, Any]]] = []
@@ -170,7 +169,7 @@ def lanes(site: Site, streets: Streets, speed: float, keep: float) -> list[list[
             first = site.node(f"street_{k + 1}{name}_in", at[0], yaw=yaws[0])
             last = site.node(f"street_{k + 1}{name}_out", at[-1], yaw=yaws[1])
             site.way(first, last, both=False, speed=speed, bends=at[1:-1].tolist(), surface="asphalt")
-            ends |= {first: _at(at[0]), last: _at(at[-1])}
+            ends |= {first: (_at(at[0]), _at(at[1] - at[0])), last: (_at(at[-1]), _at(at[-1] - at[-2]))}
             leaving.setdefault(start, []).append((first, k))
             arriving.setdefault(end, []).append((last, k))
             out[-1].append((first, lane))
@@ -179,10 +178,27 @@ def lanes(site: Site, streets: Streets, speed: float, keep: float) -> list[list[
         for last, k in coming:
             for first, j in leaving.get(junction, []):
                 if alone or j != k:
-                    straight = shapely.contains(roadway, shapely.LineString([ends[last], ends[first]]))
-                    bends = [] if straight else [streets.junctions[junction]]
+                    bends = _turn(ends[last], ends[first], streets.junctions[junction], roadway)
                     site.way(last, first, both=False, speed=speed / 2, bends=bends, surface="asphalt")
     return out
+
+
+def _turn(last: tuple[Point, Point], first: tuple[Point, Point], middle: Point, roadway: Any) -> list[Point]:
+    """Where a way through a junction bends: nowhere, where both lanes' directions meet, or in the junction's middle.
+
+    last, first: where a lane ends and the next one begins, with their directions.
+    """
+    (ax, ay), (ux, uy) = last
+    (bx, by), (vx, vy) = first
+    tried: list[list[Point]] = [[]]
+    turn = ux * vy - uy * vx
+    if abs(turn) > 0.1 * math.sqrt((ux * ux + uy * uy) * (vx * vx + vy * vy)):
+        t = ((bx - ax) * vy - (by - ay) * vx) / turn
+        tried.append([_at((ax + t * ux, ay + t * uy))])
+    for bends in tried:
+        if shapely.contains(roadway, shapely.LineString([last[0], *bends, first[0]])):
+            return bends
+    return [middle]
 
 
 def _lane(streets: Streets, line: Any, start: int, end: int, off: float) -> Any:

@@ -19,7 +19,7 @@ from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
 from tests.generate import looks
 
-DIGEST = "1d0db5670c2b14c87a8b20aab0c9fcdf18a0b94bd3d032d0aaa33f9ec2f48d18"
+DIGEST = "4661eac93fc20d758d5ef2fd36e3e9ea1a91f56766f932c27a9853edf9130c35"
 SQUARE = shapely.box(0, 0, 100, 60)
 
 
