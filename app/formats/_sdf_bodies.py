@@ -145,6 +145,7 @@ class Bodies:
         self.context, self.resources, self.usual = context, resources, usual
         self.files: dict[str, bytes] = {}
         self.newest = (1, 4)
+        self.hilly = False  # whether a height map is the ground
         self._filled: set[tuple[str, float | Colour, str, str]] = set()
         self._lost: Counter[tuple[str, str]] = Counter()
         self._box: list[tuple[float, float, float, float]] = []
@@ -178,6 +179,7 @@ class Bodies:
         name = said.get("name")
         name = free_name(name if isinstance(name, str) and name else one.id, taken)
         self._measure(one.geometry)
+        self.hilly = self.hilly or any(shape.get("type") == "heightmap" for shape in shapes)
         return self._static(name, pose, shapes, COLOURS.get(kind), said.get("gazebo"))
 
     def _taken(self, what: str, option: str, why: str = "the objects tell none") -> float:

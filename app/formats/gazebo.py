@@ -47,7 +47,7 @@ from app.formats import (
 )
 from app.formats._choice import the_one
 from app.formats._text import DEGREES, number
-from app.model import solids, worlds
+from app.model import masks, solids, worlds
 from app.model.features import Feature, Features, features, unique_ids
 from app.model.frame import GROUND, Datum, is_writable
 from app.model.grid import OccupancyGrid
@@ -537,6 +537,8 @@ class _Writer:
         else:
             self.context.drop("objects of other formats", sum(len(p) for _, p in self.others), why)
         for key, grid in self.layers.grids().items():
+            if masks.NAME in grid.properties and self.options.grid is None:
+                continue  # it tells where robots should go, not what stands there
             told = any(other.level == key.level for other, _ in self.others)
             if self.options.grid is None and everything and told and _is_slice(grid):
                 continue  # its walls are these objects
@@ -616,7 +618,7 @@ class _Writer:
 
     def _furnish(self, bodies: _sdf_bodies.Bodies) -> None:
         """A ground to stand on and a light, where a world is made."""
-        if "ground_plane" not in self.taken and self.options.ground:
+        if "ground_plane" not in self.taken and self.options.ground and not bodies.hilly:
             self.made.append(("ground_plane", bodies.ground()))
             self.context.fill("ground plane", bodies.ground_size, "no world tells of the ground", "ground")
         lit = any(e.tag == "light" or _sdf.text_of(e, "uri").lower().rstrip("/").endswith("sun") for _, e in self.made)

@@ -1,0 +1,271 @@
+"""Natural ground: hills of gradient noise as a height map, trees where vegetation is dense, and what the slopes cost.
+
+The floor of the level is where the highest hill ends: all ground lies below it, so that the grid, a slice above the
+floor, shows what stands on the ground and not the ground. How hard the ground is to drive on is a grid of its own.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive import Notes
+from app.errors import CannotGenerate
+from app.generate import MAX_OBJECTS, Source, _cells, generates
+from app.generate._noise import Fractal, noise2, noise3
+from app.generate._site import Site, SiteOptions, disc, mm, refused
+from app.model import masks
+from app.model.frame import GROUND
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import MAP, NETWORK, Layers, Part, PartKey
+from app.parameters import parameter
+
+Array = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+FILE = "heightmaps/terrain.png"
+
+POST = 0.3
+"""Metres of corner posts from the fence."""
+
+SLOWEST = 10
+"""Percent of the robot's speed on the steepest ground that it can take."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options(SiteOptions):
+    """Ground, trees, and what a robot can climb."""
+
+    width: float = parameter(40.0, "along x, where no fence says it", minimum=2.0, maximum=5000.0, unit="m")
+    depth: float = parameter(40.0, "along y, where no fence says it", minimum=2.0, maximum=5000.0, unit="m")
+    noise: Literal["simplex", "perlin"] = parameter("simplex", "which gradient noise")
+    feature: float = parameter(15.0, "from one hill to the next, about", minimum=0.1, maximum=10_000.0, unit="m")
+    octaves: int = parameter(4, "noise added up, each twice as fine as the one before", minimum=1, maximum=16)
+    persistence: float = parameter(0.4, "how strong each octave is to the one before", minimum=0.0, maximum=1.0)
+    lacunarity: float = parameter(2.0, "how fine each octave is to the one before", minimum=1.0, maximum=8.0)
+    relief: float = parameter(1.2, "from the lowest place to the highest", minimum=0.01, maximum=1000.0, unit="m")
+    epoch: float = parameter(
+        0.0, "near numbers are like ground and woods, as if some time had passed", minimum=-1e6, maximum=1e6
+    )
+    detail: Literal["65", "129", "257", "513", "1025"] = parameter(
+        "257", "heights along a side of the height map; Gazebo wants a power of two and one"
+    )
+    vegetation: float = parameter(0.25, "share of the ground that bears trees", minimum=0.0, maximum=1.0)
+    spacing: float = parameter(3.0, "from tree to tree in the woods", minimum=0.5, maximum=100.0, unit="m")
+    grove: float = parameter(12.0, "from one wood to the next, about", minimum=0.1, maximum=10_000.0, unit="m")
+    climb: float = parameter(15.0, "the steepest ground that a robot takes", minimum=0.1, maximum=89.0, unit="°")
+    rough: Literal["costs", "speed", "none"] = parameter(
+        "costs",
+        "the grid that tells of slopes, one of Nav2's filter masks: costs (0 flat, 100 too steep), or speed in percent",
+    )
+
+
+@generates(
+    {"location", "objects", "occupancy", "topology", "imagery", "resources"}, parameters=Options, also={"location"}
+)
+def terrain(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
+    """Hilly ground with woods: a height map for Gazebo, trees, and a grid of what the slopes cost."""
+    site = Site(given, options, notes)
+    box = site.bounded(shapely.box(0.0, 0.0, options.width, options.depth)).bounds
+    columns, rows = (max(1, int((b - a) / options.spacing)) for a, b in ((box[0], box[2]), (box[1], box[3])))
+    if options.vegetation and rows * columns > MAX_OBJECTS:
+        raise refused("spacing", f"{columns} × {rows} places for trees are too many: give a larger spacing")
+    n = int(options.detail)
+    x, y = np.linspace(box[0], box[2], n), np.linspace(box[1], box[3], n)
+    share = _heights(x, y, options, source)
+    grey = np.rint(share * 255.0).astype(np.uint8)
+    height = np.round((share - 1.0) * options.relief, 6)
+    floor = site.elevation(GROUND)
+    site.files[FILE] = _png(grey[::-1])
+    middle = mm((box[0] + box[2]) / 2), mm((box[1] + box[3]) / 2)
+    size = [mm(box[2] - box[0]), mm(box[3] - box[1]), mm(options.relief)]
+    ground: Mapping[str, Any] = {"type": "heightmap", "file": FILE, "size": size, "position": [0.0, 0.0, 0.0]}
+    site.put("terrain", "terrain", site.fence, shapes=[ground], pose=(*middle, floor - size[2], 0.0))
+    trees = 0
+    if options.vegetation:
+        trees = _trees(site, (x, y, height), (rows, columns), options, source)
+    if not trees:
+        _posts(site, (x, y, height), notes)
+    made = site.finish(ground="meadow")
+    grid = made.parts[PartKey("occupancy", GROUND, MAP)]
+    if not isinstance(grid, OccupancyGrid):
+        raise TypeError("a site has a grid")
+    steep = _steepness(grid, (x, y, height)) / round(math.tan(math.radians(options.climb)), 9)
+    parts: dict[PartKey, Part] = dict(made.parts)
+    if options.rough == "costs":
+        parts[PartKey("occupancy", GROUND, "costs")] = _costs(grid, steep)
+    elif options.rough == "speed":
+        parts[PartKey("occupancy", GROUND, "speed")] = _speed(grid, steep)
+    level = np.where((grid.cells == FREE) & (steep >= 1.0), np.uint8(OCCUPIED), grid.cells)
+    ways = _cells.ways_of(replace(grid, cells=level), options.robot_radius, notes)
+    if ways is not None:
+        parts[PartKey("topology", GROUND, NETWORK)] = ways
+    return Layers(dict(sorted(parts.items())), made.datum, made.levels)
+
+
+def _heights(x: Array, y: Array, options: Options, source: Source) -> Array:
+    """Heights from 0 (the lowest place) to 1, row 0 at the smallest y."""
+    fractal = Fractal(options.noise, options.feature, options.octaves, options.persistence, options.lacunarity)
+    field = noise3(x, y, np.array([options.epoch]), fractal, source.stream("ground"))[0]
+    low, high = float(field.min()), float(field.max())
+    if high - low < 1e-9:
+        raise CannotGenerate("the ground is flat: give a smaller feature, or more octaves")
+    return np.asarray((field - low) / (high - low), np.float64)
+
+
+def _trees(
+    site: Site, ground: tuple[Array, Array, Array], shape: tuple[int, int], options: Options, source: Source
+) -> int:
+    """A tree in each place of a coarse raster where the vegetation's noise is among the densest; how many."""
+    rows, columns = shape
+    low_x, low_y = float(ground[0][0]), float(ground[1][0])
+    draw = np.round(source.stream("trees").random((rows, columns, 4)), 6)
+    x = np.asarray(low_x + (np.arange(columns) + 0.5) * options.spacing, np.float64)
+    y = np.asarray(low_y + (np.arange(rows) + 0.5) * options.spacing, np.float64)
+    fractal = Fractal(options.noise, options.grove, 3)
+    if options.epoch:
+        dense = noise3(x, y, np.array([options.epoch]), fractal, source.stream("woods"))[0]
+    else:
+        dense = noise2(x, y, fractal, source.stream("woods"))
+    dense = np.round(dense, 9)
+    wanted = max(1, round(options.vegetation * dense.size))
+    order = np.argsort(-dense.ravel(), kind="stable")[:wanted]
+    inner = shapely.buffer(site.fence, -0.3)
+    shapely.prepare(inner)
+    floor = site.elevation(GROUND)
+    count = 0
+    for place in np.sort(order).tolist():
+        r, c = divmod(place, columns)
+        u, v, thick, tall = draw[r, c].tolist()
+        at = mm(x[c] + (u - 0.5) * 0.6 * options.spacing), mm(y[r] + (v - 0.5) * 0.6 * options.spacing)
+        if not inner.contains(shapely.Point(at)):
+            continue
+        count += 1
+        base = mm(float(_at(ground, np.array([at[0]]), np.array([at[1]]))[0]))
+        radius, height = mm(0.1 + 0.15 * thick), mm(5.0 + 7.0 * tall)
+        # Its trunk is to be met above the level's floor, wherever its foot is.
+        stem = mm(0.6 * height - base)
+        crown = mm(min(0.22 * height, options.spacing))
+        trunk: Mapping[str, Any] = {
+            "type": "cylinder",
+            "radius": radius,
+            "length": stem,
+            "pose": [0.0, 0.0, mm(stem / 2), 0.0, 0.0, 0.0],
+        }
+        leaves: Mapping[str, Any] = {
+            "type": "ellipsoid",
+            "radii": [crown, crown, mm(0.3 * height)],
+            "pose": [0.0, 0.0, mm(stem + 0.1 * height), 0.0, 0.0, 0.0],
+            "visual": True,
+        }
+        site.put(
+            f"tree/{count}",
+            "tree",
+            shapely.Point(at),
+            shapes=[trunk, leaves],
+            pose=(*at, floor + base, 0.0),
+            colour=("crown", "crown_light", "crown_dark")[count % 3],
+            seen=disc(*at, crown),
+            width=mm(2 * radius),
+            height=mm(stem + 0.4 * height + base),
+        )
+    return count
+
+
+def _posts(site: Site, ground: tuple[Array, Array, Array], notes: Notes) -> None:
+    """A post at each corner of bare ground: without anything that stands there is nothing to find one's place by."""
+    inner = shapely.buffer(site.fence, -POST, join_style="mitre")
+    if inner.is_empty or inner.geom_type != "Polygon":
+        raise CannotGenerate("the ground is too narrow for posts at its corners: give some vegetation")
+    corners = shapely.get_coordinates(inner.exterior)[:-1]
+    for count, (x, y) in enumerate(corners.tolist(), 1):
+        base = mm(float(_at(ground, np.array([x]), np.array([y]))[0]))
+        length = mm(1.0 - base)
+        solid = {
+            "type": "cylinder",
+            "radius": 0.05,
+            "length": length,
+            "pose": [0.0, 0.0, mm(length / 2), 0.0, 0.0, 0.0],
+        }
+        at = mm(x), mm(y)
+        site.put(
+            f"post/{count}",
+            "post",
+            shapely.Point(at),
+            shapes=[solid],
+            pose=(*at, site.elevation(GROUND) + base, 0.0),
+            colour="wood",
+            seen=disc(*at, 0.05),
+            width=0.1,
+            height=1.0,
+        )
+    notes.fill("posts", len(corners), "no tree stands there: corner posts are what a robot can see")
+
+
+def _at(ground: tuple[Array, Array, Array], x: Array, y: Array) -> Array:
+    """Heights at points, straight between those of the map."""
+    xs, ys, height = ground
+    u = np.clip((x - xs[0]) / (xs[-1] - xs[0]), 0.0, 1.0) * (len(xs) - 1)
+    v = np.clip((y - ys[0]) / (ys[-1] - ys[0]), 0.0, 1.0) * (len(ys) - 1)
+    i, j = np.minimum(u.astype(np.int64), len(xs) - 2), np.minimum(v.astype(np.int64), len(ys) - 2)
+    a, b = u - i, v - j
+    low = height[j, i] * (1 - a) + height[j, i + 1] * a
+    high = height[j + 1, i] * (1 - a) + height[j + 1, i + 1] * a
+    return np.asarray(low * (1 - b) + high * b, np.float64)
+
+
+def _steepness(grid: OccupancyGrid, ground: tuple[Array, Array, Array]) -> Array:
+    """The slope at each cell of a grid, metres up a metre: float64 [height, width]."""
+    xs, ys, height = ground
+    up_y, up_x = np.gradient(height, ys, xs)
+    steep = np.sqrt(up_x * up_x + up_y * up_y)
+    r = grid.resolution
+    x = np.asarray(grid.origin[0] + (np.arange(grid.width) + 0.5) * r, np.float64)
+    out = np.empty((grid.height, grid.width))
+    for row in range(grid.height):  # a row at a time: the arrays in between stay small
+        y = np.full(grid.width, grid.origin[1] + (row + 0.5) * r)
+        out[row] = _at((xs, ys, steep), x, y)
+    return np.round(out, 6)
+
+
+def _costs(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
+    """Nav2's keepout mask: 0 where it is flat, 100 where it is too steep or something stands, between in proportion."""
+    cells = np.where(steep >= 1.0, OCCUPIED, np.floor(np.minimum(steep, 1.0) * 99.0)).astype(np.uint8)
+    cells = np.where(grid.cells == FREE, cells, grid.cells).astype(np.uint8)
+    said = {masks.NAME: {"params": masks.params("costs", masks.Info(masks.KEEPOUT, 0.0, 1.0))}}
+    return OccupancyGrid(cells, grid.resolution, grid.origin, mode="raw", properties=said)
+
+
+def _speed(grid: OccupancyGrid, steep: Array) -> OccupancyGrid:
+    """Nav2's speed mask: percent of the robot's speed; 0, no limit, where it is nobody's business."""
+    percent = np.maximum(np.rint(100.0 * (1.0 - np.minimum(steep, 1.0))), SLOWEST).astype(np.uint8)
+    cells = np.where(grid.cells == UNKNOWN, 0, percent).astype(np.uint8)
+    info = masks.Info(masks.SPEED_PERCENT, 0.0, 1.0)
+    said = {masks.NAME: {"params": masks.params("speed", info)}}
+    return OccupancyGrid(cells, grid.resolution, grid.origin, mode="raw", properties=said)
+
+
+def _png(grey: U8) -> bytes:
+    """An 8-bit grey PNG that is the same on every machine: nothing is compressed, since how that is done differs."""
+    rows, columns = grey.shape
+    data = np.concatenate([np.zeros((rows, 1), np.uint8), grey], axis=1).tobytes()
+    blocks = [b"\x78\x01"]
+    for at in range(0, len(data), 65535):
+        part = data[at : at + 65535]
+        last = at + 65535 >= len(data)
+        blocks.append(struct.pack("<BHH", last, len(part), len(part) ^ 0xFFFF) + part)
+    blocks.append(struct.pack(">I", zlib.adler32(data)))
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", b"".join(blocks)) + chunk(b"IEND", b"")
