@@ -21,7 +21,7 @@ from app.convert import offline
 from app.formats import Limits
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid
-from tests.bench import events, floors, http, large, networks
+from tests.bench import events, floors, generate, http, large, networks
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config/"
@@ -226,10 +226,12 @@ def main() -> int:
     parser.add_argument("--tries", type=int, default=7, help="counted runs of each conversion (default 7)")
     parser.add_argument("--json", action="store_true", help="machine-readable output")
     parser.add_argument(
-        "--only", choices=["conversions", "serving", "networks", "large", "events"], help="one of the tables"
+        "--only",
+        choices=["conversions", "serving", "networks", "large", "events", "generate"],
+        help="one of the tables",
     )
     arguments = parser.parse_args()
-    if not DATA.is_dir() and arguments.only != "events":
+    if not DATA.is_dir() and arguments.only not in ("events", "generate"):
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
         return 2
     converted = conversions(arguments.tries) if arguments.only in (None, "conversions") else []
@@ -237,8 +239,10 @@ def main() -> int:
     derived = networks.rows(farm_grid(), arguments.tries) if arguments.only in (None, "networks") else []
     big = memory() if arguments.only in (None, "large") else []
     told = events.rows() if arguments.only in (None, "events") else []
+    made = generate.rows() if arguments.only in (None, "generate") else []
     if arguments.json:
         tables = {"conversions": converted, "serving": served, "networks": derived, "large": big, "events": told}
+        tables["generate"] = made
         print(json.dumps(tables, indent=2))
     else:
         console = Console(width=110)
@@ -256,7 +260,7 @@ def main() -> int:
                     "yes" if r["holds"] else "NO",
                 )
             console.print(table)
-        for title, rows in (("served", served), ("grid → network", derived), ("events", told)):
+        for title, rows in (("served", served), ("grid → network", derived), ("events", told), ("generated", made)):
             if not rows:
                 continue
             table = Table(title, "peer", "ours", "unit", "ratio", "bound", "holds")
@@ -284,7 +288,7 @@ def main() -> int:
                     "yes" if r["holds"] else "NO",
                 )
             console.print(table)
-    return 0 if all(r["holds"] for r in [*converted, *served, *derived, *big, *told]) else 1
+    return 0 if all(r["holds"] for r in [*converted, *served, *derived, *big, *told, *made]) else 1
 
 
 if __name__ == "__main__":
