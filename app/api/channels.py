@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
 from app import fleet
 from app.api.access import Editor, Viewer
-from app.api.answers import Route, answer
+from app.api.answers import Route, answer, json_bytes
+from app.api.caching import none_match
 from app.api.schemas import ChannelBody, ChannelOut, ChannelPath, EnvironmentPath, told
 from app.api.services import Here, Services
 from app.errors import Invalid, Problem
@@ -53,6 +55,7 @@ def _one(here: Services, env: str, channel: Channel) -> dict[str, Any]:
 @router.get("", responses=told(list[ChannelOut], 404), summary="All channels")
 def list_channels(
     env: EnvironmentPath,
+    request: Request,
     here: Here,
     _: Viewer,
     robots: Annotated[
@@ -64,8 +67,15 @@ def list_channels(
     `robots.since` is told where all robots of a channel hold its root: from then on they have. `holding`, `lagging` and
     `failed` make up the `total`; `ready` have what is planned.
     """
-    fleet_of, now = here.store.robots(env) if robots else None, datetime.now(UTC)
-    return answer([as_dict(channel, fleet_of, now) for channel in here.store.channels(env)])
+    generation, now = here.hot.generation(), datetime.now(UTC)
+    fleet_of = here.store.robots(env) if robots else None
+    data = json_bytes([as_dict(channel, fleet_of, now) for channel in here.store.channels(env)])
+    headers = {"etag": f'"{hashlib.sha256(data).hexdigest()[:40]}"', "cache-control": "no-cache"}
+    if not robots:  # this is what robots ask for, all of them at once
+        here.hot.keep(request, env, headers, data, generation)
+    if none_match(request.headers.get("if-none-match"), headers["etag"]):
+        return Response(status_code=304, headers=headers)
+    return Response(data, 200, headers, "application/json")
 
 
 @router.put("/{channel}", responses=told(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan it")

@@ -45,7 +45,9 @@ def list_keys(here: Here, _: Viewer) -> Response:
 )
 def rotate_key(here: Here, _: Admin) -> Response:
     """From now on a new key signs. Robots that trust the old one follow, since it vouches for the new one."""
-    return answer(here.keys.rotate().as_dict(), 201)
+    made = here.keys.rotate()
+    here.store.generation.change()  # what was signed with the old key is in memory no longer
+    return answer(made.as_dict(), 201)
 
 
 @router.get(
@@ -75,6 +77,7 @@ async def get_manifest(
     """
     names = _names(formats)
     channel = None if isinstance(number_of(v), int) else v
+    generation = here.hot.generation()
     version, sequence = await run_in_threadpool(here.store.standing, env, number_of(v))
     files: list[dict[str, Any]] = []
     for name in names:
@@ -107,6 +110,7 @@ async def get_manifest(
     signed = f"{key}:{base64.b64encode(signature).decode()}"
     etag = f'"{signed[-40:-2]}"'
     headers = {"etag": etag, "cache-control": "no-cache", SIGNATURE: signed}
+    here.hot.keep(request, env, headers, data, generation)
     if none_match(request.headers.get("if-none-match"), etag):
         return Response(status_code=304, headers=headers)
     return Response(data, 200, headers, "application/json")

@@ -63,10 +63,12 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Resource:
-    """What stands at an address. body: None while it is not made, or too large for memory; path: then its file."""
+    """What stands at an address. recipe: None where it is no map. body: None while it is not made, or too large for
+    memory; path: then its file.
+    """
 
     wanted: Wanted
-    recipe: Recipe
+    recipe: Recipe | None
     etag: str
     raw_etag: bytes
     headers: Headers
@@ -112,7 +114,7 @@ class Hot:
         while True:
             recipe = await self._recipe(key, here, wanted, values, derive)
             old = self._entries.get(key)
-            if old is not None and _same(old.recipe, recipe) and old.body is not None:
+            if old is not None and old.recipe is not None and _same(old.recipe, recipe) and old.body is not None:
                 fresh = replace(old, generation=generation, fresh_until=until)
                 self._put(key, fresh)
                 return fresh
@@ -176,6 +178,27 @@ class Hot:
         headers = [*bare, (b"link", link), (b"x-content-type-options", b"nosniff")]
         tally = self._tallies.setdefault(route, [0, 0])
         return Resource(wanted, recipe, etag, etag.encode(), headers, bare, 0, None, None, "", generation, until, tally)
+
+    def keep(
+        self, request: Request, environment: str, headers: Mapping[str, str], body: bytes, generation: int
+    ) -> None:
+        """Another answer (200, with an ``etag``) that a whole fleet asks for at once; good until the next commit.
+
+        generation: as it was before the store was asked. Whoever may enter the environment gets it.
+        """
+        scope = request.scope
+        key: Key = (scope.get("raw_path") or scope["path"].encode(), scope["query_string"])
+        bare = [(name.encode(), value.encode()) for name, value in headers.items()]
+        full = [*bare, (b"content-length", str(len(body)).encode()), (b"content-type", b"application/json")]
+        full.append((b"x-content-type-options", b"nosniff"))
+        tally = self._tallies.setdefault(scope["route"].path, [0, 0])
+        wanted, until, etag = Wanted(environment, None, "", None), time.monotonic() + FRESH_SECONDS, headers["etag"]
+        self._put(
+            key,
+            Resource(
+                wanted, None, etag, etag.encode(), full, bare, len(body), body, None, "", generation, until, tally
+            ),
+        )
 
     def count(self) -> None:
         """Add what was answered from memory since the last call to the metrics."""

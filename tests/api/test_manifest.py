@@ -191,3 +191,36 @@ def test_a_fleet_that_asks_for_a_new_map_costs_one_conversion(api: Api, bare: st
     with ThreadPoolExecutor(40) as pool:
         assert len(set(pool.map(ask, range(40)))) == 1
     assert made() - before == 1
+
+
+def test_what_a_fleet_asks_for_at_once_comes_from_memory_and_is_never_old(api: Api, farm: str) -> None:
+    place = f"environments/{farm}"
+    asked = (f"{place}/versions/latest/manifest?formats=tmap2", f"{place}/channels?robots=false")
+    hot = api.app.state.services.hot
+
+    def known(path: str) -> bool:
+        where, _, query = f"/api/v1/{path}".partition("?")
+        return hot.get((where.encode(), query.encode())) is not None
+
+    for path in asked:
+        first = api.get(path)
+        again = api.get(path)
+        assert known(path)
+        assert again.content == first.content
+        assert {k: v for k, v in again.headers.items() if k != "date"}.items() >= {
+            "etag": first.headers["etag"], "content-type": "application/json", "cache-control": "no-cache",
+        }.items()  # fmt: skip
+        assert again.headers.get("fleetmap-signature") == first.headers.get("fleetmap-signature")
+        assert api.get(path, 304, headers={"If-None-Match": first.headers["etag"]}).content == b""
+        api.as_("none").problem("GET", path, 401)
+        api.token_for("viewer", environments="other-*").problem("GET", path, 403)
+    check(api, api.get(asked[0]))
+    api("PUT", f"{place}/channels/production", 200, json={"version": 2})
+    assert not known(asked[1])
+    assert {c["channel"]: c["version"] for c in api.get(asked[1]).json()} == {"latest": 3, "production": 2}
+    api.upload(farm, {"n.tmap2.yaml": samples.tmap2({"a": (0.0, 1.0), "b": (5.0, 1.0)}, (("a", "b"),))})
+    assert check(api, api.get(asked[0]))["version"] == 4
+    old = api.get(asked[0]).headers["fleetmap-signature"].partition(":")[0]
+    new = api.post("keys", expect=201).json()["id"]
+    assert api.get(asked[0]).headers["fleetmap-signature"].partition(":")[0] == new != old
+    assert "robots" in api.get(f"{place}/channels").json()[0]
