@@ -41,7 +41,7 @@ def serving(command: list[str], port: int, env: dict[str, str] | None = None) ->
     """A server process on a loopback port, ended afterwards."""
     process = subprocess.Popen(command, env={**os.environ, **(env or {})}, stdout=subprocess.DEVNULL)
     try:
-        for _ in range(600):
+        for _ in range(2400):
             with socket.socket() as s:
                 if s.connect_ex(("127.0.0.1", port)) == 0:
                     break
@@ -49,7 +49,7 @@ def serving(command: list[str], port: int, env: dict[str, str] | None = None) ->
                 raise RuntimeError(f"the server ended with {process.returncode}")
             time.sleep(0.05)
         else:
-            raise RuntimeError("the server did not start within 30 s")
+            raise RuntimeError("the server did not start within 120 s")
         yield
     finally:
         process.terminate()
