@@ -18,7 +18,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from app.agent.core import Agent, Options
 from app.events import messages
 from app.events.bus import BusOptions, router_configuration
 from app.events.router import Router
+from app.store.generation import Generation
 from tests.bench import http
 
 SESSIONS = 100
@@ -113,8 +113,11 @@ def open_session(port: int) -> zenoh.Session:
 
 
 def latency() -> list[dict[str, Any]]:
-    """Half of all deliveries of an event at 100 sessions, from the time in it (taken before its commit), against the
-    same bytes put by a bare session to plain subscribers of the same sessions.
+    """Half of all deliveries of an event at 100 sessions, from its commit, against the same bytes put by a bare session
+    to plain subscribers of the same sessions.
+
+    The commit is seen by the number that the store changes right after it (``app.store.generation``): the last change
+    before the event came first.
     """
     port, zenoh_port = http.free_port(), http.free_port()
     with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port) as client:
@@ -142,16 +145,26 @@ def latency() -> list[dict[str, Any]]:
             held.append(session.declare_subscriber("bare/events", take_bare))
         time.sleep(3.0)
         arrived.clear()
+        generation, ours = Generation(Path(folder) / "blobs"), []
         for k in range(COMMITS):
             before = len(arrived)
-            commit(client, 0.001 * (k + 1))
+            writer = threading.Thread(target=commit, args=(client, 0.001 * (k + 1)))
+            seen, changed = generation(), time.time()
+            writer.start()
+            while len(arrived) == before:
+                now = generation()
+                if now != seen:
+                    seen, changed = now, time.time()
+                time.sleep(0.0002)
             _until(lambda n=before: len(arrived) >= n + SESSIONS)
+            writer.join()
+            ours += [(at - changed) * 1e3 for at, _ in arrived[before:]]
             time.sleep(0.05)
+        generation.close()
         size = len(arrived[-1][1])
         command = [sys.executable, "-m", "tests.bench.events", "put", str(zenoh_port), str(COMMITS), str(size)]
         subprocess.run(command, check=True, timeout=120)
         _until(lambda: len(bare) >= SESSIONS * COMMITS)
-        ours = [(at - datetime.fromisoformat(json.loads(body)["time"]).timestamp()) * 1e3 for at, body in arrived]
         floor = [(at - json.loads(body)["time"]) * 1e3 for at, body in bare]
         for session in sessions:
             session.close()  # type: ignore[no-untyped-call]
