@@ -55,6 +55,9 @@ ROW = 3
 SHAPELESS = 0.25
 """Metres around a model of which nobody has supplied the shape."""
 
+HALF = 0.71
+"""Of a cell's side: how far its corners are from its middle. Who measures from cell to cell errs by as much."""
+
 TRIES = 40
 """Places that are tried for each new obstacle."""
 
@@ -489,7 +492,8 @@ class _Level:
         tree, was = shapely.STRtree(boxes), shapely.STRtree(old)
         for key, part in self.lines.items():
             metres = shapely.force_2d(part.in_local(self.given.frame))
-            hit = _nearest(tree, metres, self.options.robot_radius) < self._reach(was, metres)
+            coarse = HALF * (change.size or (main.resolution if main is not None else 0.0))
+            hit = _nearest(tree, metres, self.options.robot_radius + coarse) < self._reach(was, metres, coarse)
             edge = np.array([p.get("kind") == "edge" for p in part.properties])
             kept += [g for g, e, h in zip(metres, edge, hit, strict=True) if e and not h and not g.is_empty]
             crossed = [part.ids[k] for k in np.flatnonzero(hit & edge)]
@@ -510,12 +514,12 @@ class _Level:
                 self._warn("removed", covered, key, "nodes")
         return out, kept
 
-    def _reach(self, was: shapely.STRtree, metres: NDArray[np.object_]) -> Array:
-        """How near an obstacle may come to each line or point: the robot's radius; where one was nearer before, so that
-        a smaller robot is meant, half of that distance."""
+    def _reach(self, was: shapely.STRtree, metres: NDArray[np.object_], coarse: float) -> Array:
+        """How near an obstacle may come to each line or point: the robot's radius, and as much as cells are coarse;
+        where one was nearer than that before, so that a smaller robot is meant, half of that distance."""
         radius = self.options.robot_radius
         away = _nearest(was, metres, radius)
-        return np.where(away < radius, away / 2, np.nextafter(radius, np.inf))
+        return np.where(away < radius - 2 * coarse, away / 2, np.nextafter(radius + coarse, np.inf))
 
     def _warn(self, what: str, ids: Sequence[str], key: PartKey, kind: str = "edges") -> None:
         if ids:

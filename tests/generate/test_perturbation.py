@@ -109,8 +109,8 @@ def test_the_grid_follows_the_objects_and_the_network_both() -> None:
     assert {k.layer for k in made.parts} <= {"objects", "occupancy", "topology"}
 
 
-@pytest.mark.parametrize("site", ["office", "hospital"])
-def test_sites_of_several_levels_still_agree(site: str) -> None:
+@pytest.mark.parametrize("site", ["hospital", "warehouse", "cluttered_hall"])
+def test_made_up_sites_still_agree(site: str) -> None:
     before, _ = make(site)
     after, _, _ = disturbed(before, **STILL, obstacles=12)
     world(after, 0.2)
