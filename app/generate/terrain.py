@@ -131,11 +131,8 @@ def _trees(
     x = np.asarray(low_x + (np.arange(columns) + 0.5) * options.spacing, np.float64)
     y = np.asarray(low_y + (np.arange(rows) + 0.5) * options.spacing, np.float64)
     fractal = Fractal(options.noise, options.grove, 3)
-    if options.epoch:
-        dense = noise3(x, y, np.array([options.epoch]), fractal, source.stream("woods"))[0]
-    else:
-        dense = noise2(x, y, fractal, source.stream("woods"))
-    dense = np.round(dense, 9)
+    dense = np.round(noise3(x, y, np.array([options.epoch]), fractal, source.stream("woods"))[0], 9)
+    soil = np.round(noise2(x, y, Fractal(options.noise, 2 * options.grove, 2), source.stream("soil")), 9)
     wanted = max(1, round(options.vegetation * dense.size))
     order = np.argsort(-dense.ravel(), kind="stable")[:wanted]
     inner = shapely.buffer(site.fence, -0.3)
@@ -150,7 +147,8 @@ def _trees(
             continue
         count += 1
         base = mm(float(_at(ground, np.array([at[0]]), np.array([at[1]]))[0]))
-        radius, height = mm(0.1 + 0.15 * thick), mm(5.0 + 7.0 * tall)
+        good = 0.5 * (tall + 0.5 + 0.5 * float(soil[r, c]))  # of chance and of the soil, which lasts
+        radius, height = mm(0.1 + 0.15 * thick), mm(5.0 + 7.0 * good)
         # Its trunk is to be met above the level's floor, wherever its foot is.
         stem = mm(0.6 * height - base)
         crown = mm(min(0.22 * height, options.spacing))

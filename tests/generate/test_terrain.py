@@ -30,7 +30,7 @@ from tests.generate import looks
 Array = NDArray[np.float64]
 GRID = PartKey("occupancy")
 COSTS = PartKey("occupancy", name="costs")
-NOISE, GROUND = "c9ffde907188bc8f", "0b99f4f38d5fe8e3"
+NOISE, GROUND = "c9ffde907188bc8f", "556c0a6d595320f0"
 SMALL: dict[str, Any] = {"width": 20, "depth": 15, "detail": "65"}
 
 
@@ -251,6 +251,13 @@ def test_time_changes_the_ground_a_little() -> None:
 
     now, soon, later = ground(0.0), ground(0.2), ground(300.0)
     assert 0 < np.abs(now - soon).mean() < 0.25 * np.abs(now - later).mean()
+
+    def woods(epoch: float) -> set[tuple[float, float]]:
+        site, _ = looks.make("terrain", epoch=epoch, **SMALL)
+        (objects,) = site.vector("objects").values()
+        return {tuple(p["pose"][:2]) for p in objects.properties if p["kind"] == "tree"}
+
+    assert len(woods(0.0) & woods(0.2)) > len(woods(0.0) & woods(300.0))
 
 
 def test_bare_ground_has_posts_at_its_corners() -> None:
