@@ -240,17 +240,22 @@ def _vertex_says(p: Properties) -> dict[str, Any]:
 class Flow:
     """Writes values in flow style, on one line. Equal mappings are written once."""
 
+    MOST = 4096
+    """Mappings whose text is kept for the next one: those with a name of their own never come again."""
+
     def __init__(self) -> None:
-        self._known: dict[bytes, str] = {}
+        self._known: dict[str, str] = {}
 
     def __call__(self, value: Any) -> str:
         """The value as YAML that PyYAML and yaml-cpp read alike; mappings by sorted keys."""
         if isinstance(value, dict):
             if not value:
                 return "{}"
-            key = orjson.dumps(value)
+            key = orjson.dumps(value).decode()  # the bytes take 4 kB, however few they are
             said = self._known.get(key)
             if said is None:
+                if len(self._known) >= self.MOST:
+                    self._known.clear()
                 said = "{" + ", ".join(f"{_yaml.text(k)}: {self(value[k])}" for k in sorted(value)) + "}"
                 self._known[key] = said
             return said

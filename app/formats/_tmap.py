@@ -748,7 +748,7 @@ class _Writer:
         fill = own is None or self.legacy
         self.filled["edges"] += own is None if self.listed else fill
         # Edges alike but for their id and target share their text.
-        key = orjson.dumps((action, rest, more, fill)) if rest or more or action else fill
+        key = orjson.dumps((action, rest, more, fill)).decode() if rest or more or action else fill
         pieces = self.templates.get(key)
         if pieces is None:
             pieces = self.templates[key] = self._edge_template(rest, action, more, fill=fill)
@@ -821,7 +821,7 @@ class _Writer:
         self.filled["orientations"] += quaternion is None
         fill = own is None or self.legacy
         self.filled["nodes"] += own is None if self.listed else fill
-        key = ("node", quaternion is None, fill, orjson.dumps((rest, more)) if rest or more else None)
+        key = ("node", quaternion is None, fill, orjson.dumps((rest, more)).decode() if rest or more else None)
         pieces = self.templates.get(key)
         if pieces is None:
             pieces = self.templates[key] = self._node_template(

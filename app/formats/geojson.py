@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from io import BytesIO
 from itertools import chain
 from typing import Any, NoReturn, cast
 
@@ -683,9 +684,14 @@ def _dump(value: Any) -> bytes:
     """One line for each feature, so that texts compare well."""
     if isinstance(value, dict) and value.get("type") == "FeatureCollection":
         head = {k: v for k, v in value.items() if k != "features"}
-        rows = [orjson.dumps(row) for row in value["features"]]
-        body = b"[\n" + b",\n".join(rows) + b"\n]" if rows else b"[]"
-        return orjson.dumps(head)[:-1] + b',"features":' + body + b"}\n"
+        out = BytesIO()  # not joined from rows: orjson's answers take 4 kB and more each, however short they are
+        out.write(orjson.dumps(head)[:-1])
+        out.write(b',"features":[')
+        for k, row in enumerate(value["features"]):
+            out.write(b",\n" if k else b"\n")
+            out.write(orjson.dumps(row))
+        out.write(b"\n]}\n" if value["features"] else b"]}\n")
+        return out.getvalue()
     return orjson.dumps(value) + b"\n"
 
 

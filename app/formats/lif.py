@@ -665,7 +665,7 @@ class _Writer:
         lists += [document.get("dangling") for document in self.documents]
         seen = set()
         for edge in (e for said in lists for e in _objects(said)):
-            item, key = own(edge, "item"), orjson.dumps(edge, option=orjson.OPT_SORT_KEYS)
+            item, key = own(edge, "item"), orjson.dumps(edge, option=orjson.OPT_SORT_KEYS).decode()
             if isinstance(item.get("edgeId"), str) and key not in seen:
                 seen.add(key)
                 self._put("edges", {NAME: edge}, GROUND, item["edgeId"], item)

@@ -19,8 +19,10 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from io import BytesIO
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -46,7 +48,7 @@ from app.formats._rmf import (
     value_of,
 )
 from app.formats._text import METRES, numbers
-from app.model.features import Features, Properties, features, from_columns, points, segments, unique_ids
+from app.model.features import Compact, Features, Properties, features, from_columns, points, segments, unique_ids
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, Part, PartKey
 
@@ -57,6 +59,12 @@ SHAFT_GAP = 0.05
 PARALLEL = 0.01
 """rmf_building_map_tools takes a lane and a door for parallel where the determinant of their directions is smaller, in
 the units of the building's file."""
+
+SHARED = 4096
+"""Different parameters of lanes, of which equal ones are kept once."""
+
+ROWS = 10_000
+"""Lines that are turned into bytes at once."""
 
 LANE_WORDS = ("mutex", "demo_mock_floor_name", "demo_mock_lift_name")
 """A building's lane parameters that a graph takes over as they are, where they are not empty."""
@@ -69,7 +77,7 @@ LANE_WORDS = ("mutex", "demo_mock_floor_name", "demo_mock_lift_name")
 class _Level:
     """A level as all graphs together tell it."""
 
-    nodes: dict[bytes, int] = field(default_factory=dict)
+    nodes: dict[str, int] = field(default_factory=dict)
     at: list[tuple[float, float]] = field(default_factory=list)
     nodes_say: list[dict[str, Any]] = field(default_factory=list)
     edges: list[tuple[int, int, dict[str, Any]]] = field(default_factory=list)
@@ -85,12 +93,14 @@ def read(files: Files, context: ReadContext) -> Layers:
     tops: dict[str, Any] = {}
     doors: dict[str, tuple[Any, list[int], int]] = {}
     lifts: dict[str, tuple[Any, list[int], int]] = {}
-    for graph, top in graphs.items():
+    for graph in graphs:
+        top, graphs[graph] = graphs[graph], {}  # what was parsed is let go before the features are made
         tops[str(graph)] = {key: value for key, value in top.items() if key not in ("levels", "doors", "lifts")}
         for name, said in mapping(top.get("levels"), "levels").items():
             _level(levels.setdefault(name, _Level()), graph, mapping(said, f"levels.{name}"), f"levels.{name}", context)
         _collect(doors, mapping(top.get("doors"), "doors"), graph, context, "doors")
         _collect(lifts, mapping(top.get("lifts"), "lifts"), graph, context, "lifts")
+    top = said = {}
     if not levels:
         refuse("a navigation graph needs at least one level", "levels")
     if context.level != GROUND:
@@ -144,7 +154,7 @@ def _level(level: _Level, graph: int, said: Mapping[str, Any], where: str, conte
     for k, (row, (x, y)) in enumerate(zip(rows, _rmf.places(rows, f"{where}.vertices").tolist(), strict=True)):
         parameters = mapping(row[2] if len(row) > 2 else None, f"{where}.vertices[{k}][2]")
         # A graph may list twins; of other graphs each vertex is found again by what it says.
-        key = orjson.dumps((x, y, parameters, row[3:]), option=orjson.OPT_SORT_KEYS)
+        key = orjson.dumps((x, y, parameters, row[3:]), option=orjson.OPT_SORT_KEYS).decode()
         place = level.nodes.get(key)
         if place is None or str(graph) in level.nodes_say[place]["graphs"]:
             place = len(level.at)
@@ -154,6 +164,8 @@ def _level(level: _Level, graph: int, said: Mapping[str, Any], where: str, conte
             level.nodes_say.append({"graphs": {}, "parameters": parameters, **more})
         level.nodes_say[place]["graphs"][str(graph)] = k
         places.append(place)
+    shared: dict[str, dict[str, Any]] = {}
+    compact = Compact()
     for k, row in enumerate(listing(said.get("lanes"), f"{where}.lanes")):
         at = f"{where}.lanes[{k}]"
         if not isinstance(row, list) or len(row) < 2:
@@ -166,10 +178,12 @@ def _level(level: _Level, graph: int, said: Mapping[str, Any], where: str, conte
             context.warn(problem, where=at)
             continue
         more = {"more": row[3:]} if len(row) > 3 else {}
+        if len(shared) < SHARED:
+            parameters = shared.setdefault(orjson.dumps(parameters).decode(), parameters)
         rest = {"graph": graph, "index": k, "parameters": parameters, **more}
-        level.edges.append((places[i], places[j], rest))
+        level.edges.append((places[i], places[j], compact(rest)))
         if parameters.get("is_bidirectional") is True:
-            level.edges.append((places[j], places[i], {**rest, "reverse": True}))
+            level.edges.append((places[j], places[i], compact({**rest, "reverse": True})))
     rest = {key: value for key, value in said.items() if key not in ("vertices", "lanes")}
     if rest:
         level.rest[str(graph)] = rest
@@ -227,7 +241,9 @@ def _lift(levels: Mapping[str, _Level], name: str, said: Any, rest: dict[str, An
 
 
 def _network(name: str, level: _Level, taken: set[str]) -> Features:
+    level.nodes.clear()
     properties: list[Properties] = []
+    compact = Compact()
     wanted = []
     for k, rest in enumerate(level.nodes_say):
         called = rest["parameters"].get("name")
@@ -235,7 +251,7 @@ def _network(name: str, level: _Level, taken: set[str]) -> Features:
         if isinstance(called, str) and called:
             said["name"] = called
             rest["parameters"] = {key: value for key, value in rest["parameters"].items() if key != "name"}
-        properties.append({**said, NAME: rest})
+        properties.append(compact({**said, NAME: compact(rest)}))
         wanted.append(_rmf.short(called) if "name" in said else f"{_rmf.short(name, 200)}/{k}")
     ids = unique_ids(wanted, taken)
     taken.update(ids)
@@ -249,7 +265,7 @@ def _network(name: str, level: _Level, taken: set[str]) -> Features:
         limit = _limit(rest["parameters"])
         if limit:
             said["speed_limit"] = limit
-        properties.append(said)
+        properties.append(compact(said))
     lines = segments(at[sources], at[targets]) if sources else np.empty(0, object)
     return from_columns([*ids, *edges], np.concatenate([points(at), lines]), properties, "local")
 
@@ -287,11 +303,19 @@ class _Lift:
 
 @dataclass(slots=True)
 class _Edge:
-    order: tuple[bool, int, bool, int, str]
+    id: str
     source: int
     target: int
     p: Properties
     paired: bool = False
+
+    @property
+    def order(self) -> tuple[bool, int, bool, int, str]:
+        """Its place among the lanes of its file; edges that come from none follow by id."""
+        rest = own(self.p, NAME) or own(self.p, BUILDING)
+        was = rest.get("index")
+        known = isinstance(was, int)
+        return not known, was if isinstance(was, int) else 0, rest.get("reverse") is True, len(self.id), self.id
 
 
 @dataclass(slots=True)
@@ -348,7 +372,7 @@ class _Writer:
             raise MissingLayer(
                 "rmf_nav_graph needs lanes, and no node has an edge: supply a network (building.yaml, tmap2, OSM …)"
             )
-        out = {f"{graph}.yaml": self._graph(graph).encode() for graph in graphs}
+        out = {f"{graph}.yaml": self._graph(graph) for graph in graphs}
         self._count_left_out()
         if self.new_lanes:
             why = f"{self.new_lanes} edges come from another format"
@@ -369,9 +393,11 @@ class _Writer:
 
     def _count_left_out(self) -> None:
         for storey in self.storeys:
-            used = {k for edges in storey.edges.values() for e in edges for k in (e.source, e.target)}
-            listed = {k for k, p in enumerate(storey.nodes) if NAME in p}
-            self.lost["nodes without lanes"] += len(storey.nodes) - len(used | listed)
+            used = np.array([NAME in p for p in storey.nodes], bool)
+            for edges in storey.edges.values():
+                for ends in ([e.source for e in edges], [e.target for e in edges]):
+                    used[ends] = True
+            self.lost["nodes without lanes"] += int((~used).sum())
         for key, part in self.layers.vector("objects").items():
             if key.name in (BUILDING, NAME):
                 rest = sum(p.get("kind") not in ("door", "lift") for p in part.properties)
@@ -500,21 +526,16 @@ class _Writer:
                     self.lost["edges' widths"] += p.get("width") is not None
                     if NAME not in p and BUILDING not in p:
                         self.lost["edges' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
-                    rest = own(p, NAME) or own(p, BUILDING)
-                    was = rest.get("index")
-                    known = isinstance(was, int)
-                    order = (not known, was if isinstance(was, int) else 0, rest.get("reverse") is True, len(i), i)
-                    out.setdefault(graph, []).append(_Edge(order, source, target, p))
+                    out.setdefault(graph, []).append(_Edge(i, source, target, p))
         for edges in out.values():
             edges.sort(key=lambda e: e.order)
-            there = Counter((e.target, e.source, _lane_of(e.p)) for e in edges)
-            for e in edges:
-                e.paired = e.source != e.target and there[e.source, e.target, _lane_of(e.p)] > 0
+            for e, paired in zip(edges, _paired(edges, len(places)), strict=True):
+                e.paired = paired
         return out
 
     # a graph
 
-    def _graph(self, graph: int) -> str:
+    def _graph(self, graph: int) -> bytes:
         top = dict(mapping(self.tops.get(str(graph)), "graphs"))
         if "building_name" not in top:
             name = self.building.get("building_name", self.building.get("name"))
@@ -527,13 +548,6 @@ class _Writer:
             top.setdefault("offset", [value_of(parameters, key, 0) for key in ("offset_x", "offset_y")])
             if value_of(parameters, "generate_crs") is not None:
                 top.setdefault("crs_name", value_of(parameters, "generate_crs"))
-        names: Counter[str] = Counter()
-        levels = "".join(self._level(storey, graph, names) for storey in self.storeys)
-        twice = sorted(name for name, count in names.items() if count > 1)
-        if twice:
-            listed = ", ".join(twice[:5]) + (" …" if len(twice) > 5 else "")
-            problem = f"{len(twice)} names stand for several vertices, which fleet adapters refuse: {listed}"
-            self.context.warn(problem, file=f"{graph}.yaml", where="levels")
         doors = {
             d.name: {"endpoints": _rounded(d.ends), "map": d.level, **d.says}
             for d in self.doors
@@ -546,43 +560,59 @@ class _Writer:
         }
         before = {**{k: v for k, v in top.items() if k < "levels"}, "doors": doors}
         after = {**{k: v for k, v in top.items() if k > "levels"}, "lifts": lifts}
-        return f"{_yaml.mapping(before, 0)}levels:\n{levels}{_yaml.mapping(after, 0)}"
+        out = BytesIO()  # as bytes the rows take a third of their memory
+        out.write(f"{_yaml.mapping(before, 0)}levels:\n".encode())
+        names: Counter[str] = Counter()
+        for storey in self.storeys:
+            rows = self._level(storey, graph, names)
+            while some := list(islice(rows, ROWS)):
+                out.write("".join(some).encode())
+        out.write(_yaml.mapping(after, 0).encode())
+        twice = sorted(name for name, count in names.items() if count > 1)
+        if twice:
+            listed = ", ".join(twice[:5]) + (" …" if len(twice) > 5 else "")
+            problem = f"{len(twice)} names stand for several vertices, which fleet adapters refuse: {listed}"
+            self.context.warn(problem, file=f"{graph}.yaml", where="levels")
+        return out.getvalue()
 
-    def _level(self, storey: _Storey, graph: int, names: Counter[str]) -> str:
+    def _level(self, storey: _Storey, graph: int, names: Counter[str]) -> Iterator[str]:
+        """The lines of a level in a graph; names: how often vertices have each."""
         edges = storey.edges.get(graph, [])
         graphs = [own(p, NAME).get("graphs") for p in storey.nodes]
         listed = [said.get(str(graph)) if isinstance(said, dict) else None for said in graphs]
         order = sorted((k for k, at in enumerate(listed) if isinstance(at, int)), key=lambda k: (listed[k], k))
         order = list(dict.fromkeys([*order, *(k for e in edges for k in (e.source, e.target))]))
         place = {k: n for n, k in enumerate(order)}
+        yield f"  {_yaml.text(storey.name)}:\n"
+        yield from _section("lanes", self._lanes(storey, graph, edges, place))
+        yield from _section("vertices", self._vertices(storey, order, names))
+        rest = mapping(mapping(storey.document.get("level"), "level").get(str(graph)), "level")
+        yield _yaml.mapping(rest, 4) if rest else ""
+
+    def _vertices(self, storey: _Storey, order: Sequence[int], names: Counter[str]) -> Iterator[str]:
         texts = list(map(_yaml.decimal, numbers(storey.at[order].ravel(), METRES)))
-        vertices = []
         for n, k in enumerate(order):
             said = {**self._vertex(storey, k), **self.robots.at(storey.name, storey.ids[k])}
-            names[str(said["name"])] += bool(said.get("name"))
+            if said.get("name"):
+                names[str(said["name"])] += 1
             more = "".join(f", {self.flow(v)}" for v in own(storey.nodes[k], NAME).get("more") or ())
-            vertices.append(f"      - [{texts[2 * n]}, {texts[2 * n + 1]}, {self.flow(said)}{more}]\n")
+            yield f"      - [{texts[2 * n]}, {texts[2 * n + 1]}, {self.flow(said)}{more}]\n"
+
+    def _lanes(self, storey: _Storey, graph: int, edges: Sequence[_Edge], place: Mapping[int, int]) -> Iterator[str]:
         crossed = self._crossed(storey, edges)
-        lanes = []
         for n, e in enumerate(edges):
             if own(e.p, NAME).get("reverse") is True and e.paired:
                 continue  # it is told by the lane that says is_bidirectional
             more = "".join(f", {self.flow(v)}" for v in own(e.p, NAME).get("more") or ())
             said = self._lane(storey, e, crossed[n])
-            lanes.append(f"      - [{place[e.source]}, {place[e.target]}, {self.flow(said)}{more}]\n")
+            yield f"      - [{place[e.source]}, {place[e.target]}, {self.flow(said)}{more}]\n"
         for row in mapping(storey.document.get("dangling"), "dangling").get(str(graph), ()):
-            if all(0 <= v < len(order) for v in row[:2]):
+            if all(0 <= v < len(place) for v in row[:2]):
                 self.lost["lanes to vertices that did not exist"] += 1
             else:
-                lanes.append(f"      - {self.flow(row)}\n")
+                yield f"      - {self.flow(row)}\n"
                 problem = "a lane joins vertices that do not exist: fleet adapters will refuse the graph"
                 self.context.warn(problem, file=f"{graph}.yaml", where=f"levels.{storey.name}.lanes")
-        out = [f"  {_yaml.text(storey.name)}:\n"]
-        for key, rows in (("lanes", lanes), ("vertices", vertices)):
-            out += [f"    {key}:\n", *rows] if rows else [f"    {key}: []\n"]
-        rest = mapping(mapping(storey.document.get("level"), "level").get(str(graph)), "level")
-        out.append(_yaml.mapping(rest, 4) if rest else "")
-        return "".join(out)
 
     def _vertex(self, storey: _Storey, k: int) -> dict[str, Any]:
         p = storey.nodes[k]
@@ -652,6 +682,28 @@ class _Writer:
             for k in near[_meet(a[near], b[near], door.ends, storey.parallel)].tolist():
                 out[k] = door.name
         return out
+
+
+def _section(key: str, rows: Iterator[str]) -> Iterator[str]:
+    """A list of rows under a level's key."""
+    first = next(rows, None)
+    if first is None:
+        yield f"    {key}: []\n"
+    else:
+        yield f"    {key}:\n{first}"
+        yield from rows
+
+
+def _paired(edges: Sequence[_Edge], nodes: int) -> list[bool]:
+    """Whether each edge's lane has an edge the other way round. nodes: no number of a node is as high."""
+    ends = np.array([(e.source, e.target) for e in edges], np.int64).reshape(-1, 2)
+    lanes: dict[int | None, int] = {}
+    lane = np.array([lanes.setdefault(_lane_of(e.p), len(lanes)) for e in edges], np.int64)
+    forth, back = ends[:, 0] * nodes + ends[:, 1], ends[:, 1] * nodes + ends[:, 0]
+    place = np.unique(np.concatenate([forth, back]), return_inverse=True)[1]
+    key = place.reshape(2, -1) * len(lanes) + lane
+    paired: list[bool] = (np.isin(key[0], key[1]) & (ends[:, 0] != ends[:, 1])).tolist()
+    return paired
 
 
 def _meet(a: Array, b: Array, door: Array, parallel: float) -> NDArray[np.bool_]:

@@ -271,7 +271,8 @@ CASES = {
         Case("OSM of 20 MB → tmap2", osm(80_000), "tmap2", bounded=True),
         Case("building of 20 MB → openrmf", building(55_000), "openrmf", bounded=True),
         Case("building of 20 MB → rmf_nav_graph", building(55_000), "rmf_nav_graph", bounded=True),
-        Case("navigation graph of 20 MB → rmf_nav_graph", graph(85_000), "rmf_nav_graph", bounded=True),
+        # Not bounded: 59 bytes of text stand for each feature, and a feature takes ten times as much by itself.
+        Case("navigation graph of 20 MB → rmf_nav_graph", graph(85_000), "rmf_nav_graph"),
         Case("Lanelet2 of 30 MB → lanelet2", lanes(14_500), "lanelet2", bounded=True),
         Case("Lanelet2 of 30 MB → tmap2", lanes(14_500), "tmap2", bounded=True, datum=Datum(35.2, 138.8)),
         Case("points of 20 MB of text → octomap", cloud, "octomap", bounded=True),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -308,3 +309,17 @@ def test_a_building_wins_over_its_graphs_on_the_same_level() -> None:
     alone = yaml.safe_load(offline(sample("openrmf", "clinic"), "openrmf").files["building.yaml"])
     assert said == alone
     assert offline(files, "rmf_nav_graph").files == offline(sample("openrmf", "clinic"), "rmf_nav_graph").files
+
+
+def test_what_few_lanes_say_is_kept_once_and_nothing_of_the_parsed_text() -> None:
+    """Memory of a large graph is that of its features: equal parameters are one object, keys are shared."""
+    rows = "".join(f"      - [{k}, {k + 1}, {{speed_limit: 0.5}}]\n" for k in range(50))
+    places = "".join(f"      - [{k}.5, 0.0, {{name: ''}}]\n" for k in range(51))
+    text = f"building_name: hall\ndoors: {{}}\nlevels:\n  L1:\n    lanes:\n{rows}    vertices:\n{places}lifts: {{}}\n"
+    layers, _ = read({"0.yaml": text.encode()})
+    (network,) = layers.vector("topology").values()
+    edges = [p for p in network.properties if p["kind"] == "edge"]
+    assert len(edges) == 50
+    assert len({id(p["rmf_nav_graph"]["parameters"]) for p in edges}) == 1
+    assert [p["rmf_nav_graph"]["index"] for p in edges] == list(range(50))
+    assert max(sys.getsizeof(p) for p in edges) < sys.getsizeof(dict(edges[0]))
