@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from app.derive._kernels_skeleton import _DX, _DY, _REDUNDANT
-from app.derive._kernels_space import I32, I64, U8, U16, gaps
+from app.derive._kernels_space import F64, I32, I64, U8, U16, gaps
 from app.derive._native import native
 
 
@@ -37,39 +37,52 @@ from it, so that the bisectors of right-angled corners lead nowhere, and a corri
 
 
 @native
-def nearest(gap: U16, far: I32, column: I32) -> None:
-    """For each cell the squared distance to the nearest obstacle, and the column in which that lies.
+def envelope(gap: U16, y: int, at: I64, until: F64, far: I64, column: I64) -> None:
+    """For each cell of a row the squared distance to the nearest obstacle, and the column in which that lies.
 
-    The lower envelope of each row's parabolas (Felzenszwalb and Huttenlocher, Distance transforms of sampled functions,
-    2012); rows begin and end with an obstacle, so that the distance is less than half the width.
+    The lower envelope of the row's parabolas (Felzenszwalb and Huttenlocher, Distance transforms of sampled functions,
+    2012); rows begin and end with an obstacle, so that the distance is less than half the width. at, until: room of the
+    row's width, and one more.
     """
+    width = gap.shape[1]
+    n = 0
+    at[0] = 0
+    until[0], until[1] = -np.inf, np.inf
+    for x in range(1, width):
+        f = np.int64(gap[y, x]) * np.int64(gap[y, x]) + np.int64(x) * x
+        while True:
+            v = at[n]
+            g = np.int64(gap[y, v]) * np.int64(gap[y, v]) + v * v
+            s = (f - g) / (2.0 * (x - v))
+            if s > until[n]:
+                break
+            n -= 1
+        n += 1
+        at[n] = x
+        until[n], until[n + 1] = s, np.inf
+    k = 0
+    for x in range(width):
+        while until[k + 1] < x:
+            k += 1
+        v = at[k]
+        g = np.int64(gap[y, v])
+        far[x] = g * g + (x - v) * (x - v)
+        column[x] = v
+
+
+@native
+def farthest(mask: U8, gap: U16) -> int:
+    """The largest squared distance of the mask's cells to their nearest obstacle."""
     height, width = gap.shape
-    at = np.empty(width, np.int64)
-    until = np.empty(width + 1, np.float64)
+    at, until = np.empty(width, np.int64), np.empty(width + 1, np.float64)
+    far, column = np.empty(width, np.int64), np.empty(width, np.int64)
+    most = np.int64(0)
     for y in range(height):
-        n = 0
-        at[0] = 0
-        until[0], until[1] = -np.inf, np.inf
-        for x in range(1, width):
-            f = np.int64(gap[y, x]) * np.int64(gap[y, x]) + np.int64(x) * x
-            while True:
-                v = at[n]
-                g = np.int64(gap[y, v]) * np.int64(gap[y, v]) + v * v
-                s = (f - g) / (2.0 * (x - v))
-                if s > until[n]:
-                    break
-                n -= 1
-            n += 1
-            at[n] = x
-            until[n], until[n + 1] = s, np.inf
-        k = 0
+        envelope(gap, y, at, until, far, column)
         for x in range(width):
-            while until[k + 1] < x:
-                k += 1
-            v = at[k]
-            g = np.int64(gap[y, v])
-            far[y, x] = g * g + (x - v) * (x - v)
-            column[y, x] = v
+            if mask[y, x] and far[x] > most:
+                most = far[x]
+    return most
 
 
 @native
@@ -80,19 +93,32 @@ def _row(gap: U16, y: int, x: int) -> int:
 
 
 @native
-def anchors(mask: U8, gap: U16, far: I32, column: I32) -> int:
-    """Set bit 1 of the cells of the mask that lie between obstacles on opposite sides; how many these are."""
+def anchors(mask: U8, gap: U16, scale: float, rank: U16) -> int:
+    """Set bit 1 of the cells of the mask that lie between obstacles on opposite sides; how many these are.
+
+    rank: of each cell, its distance to the nearest obstacle times ``scale``. Two rows of distances are all it keeps.
+    """
     height, width = mask.shape
+    at, until = np.empty(width, np.int64), np.empty(width + 1, np.float64)
+    far, column = np.empty((2, width), np.int64), np.empty((2, width), np.int64)
+    factor = np.float32(scale)
+    rank[0] = 0
+    rank[height - 1] = 0
+    envelope(gap, 1, at, until, far[1], column[1])
     count = 0
     for y in range(1, height - 1):
+        here, below = y % 2, (y + 1) % 2
+        envelope(gap, y + 1, at, until, far[below], column[below])
+        for x in range(width):
+            rank[y, x] = np.uint16(np.sqrt(np.float32(far[here, x])) * factor)
         for x in range(1, width - 1):
             if mask[y, x] == 0:
                 continue
-            ax = np.int64(column[y, x])
+            ax = column[here, x]
             ay = np.int64(_row(gap, y, ax))
             # In the middle of an odd number of cells: the same distance to both sides.
-            g = np.int64(np.sqrt(far[y, x]))
-            if g * g == far[y, x] and (
+            g = np.int64(np.sqrt(far[here, x]))
+            if g * g == far[here, x] and (
                 (y >= g and y + g < height and gap[y - g, x] == 0 and gap[y + g, x] == 0)
                 or (x >= g and x + g < width and gap[y, x - g] == 0 and gap[y, x + g] == 0)
             ):
@@ -102,12 +128,13 @@ def anchors(mask: U8, gap: U16, far: I32, column: I32) -> int:
                 v, u = y + d, x + 1 - d
                 if mask[v, u] == 0:
                     continue
-                bx = np.int64(column[v, u])
+                other = below if d else here
+                bx = column[other, u]
                 by = np.int64(_row(gap, v, bx))
                 apart = np.sqrt((ax - bx) * (ax - bx) + (ay - by) * (ay - by))
                 # Neighbours see obstacles that are a cell farther apart, because they are at different places.
-                if apart - 1.0 >= OPPOSITE * (np.sqrt(far[y, x]) + np.sqrt(far[v, u])) / 2.0:
-                    if far[v, u] > far[y, x]:
+                if apart - 1.0 >= OPPOSITE * (np.sqrt(far[here, x]) + np.sqrt(far[other, u])) / 2.0:
+                    if far[other, u] > far[here, x]:
                         count += 1 if mask[v, u] & 2 == 0 else 0
                         mask[v, u] |= 2
                     else:
@@ -117,13 +144,34 @@ def anchors(mask: U8, gap: U16, far: I32, column: I32) -> int:
 
 
 @native
-def thin(mask: U8, order: I64, far: I32) -> int:
-    """Thin a mask in place, cells in this order (places in the flat mask, nearest to obstacles first); what is left.
+def counted(mask: U8, rank: U16, out: I64) -> None:
+    """How many cells of the mask there are of each rank ([65536])."""
+    height, width = mask.shape
+    for y in range(height):
+        for x in range(width):
+            if mask[y, x]:
+                out[rank[y, x]] += 1
 
-    Bit 1 marks anchors. In the end the mask is one cell wide and of zeros and ones.
-    """
+
+@native
+def sorted_band(mask: U8, rank: U16, low: int, high: int, place: I64, out: I32) -> None:
+    """The cells of the mask with ranks from ``low`` to before ``high``, by rank, then row and column, as places in the
+    flat mask. place: where the cells of each rank begin in ``out``, [high - low]; it is counted up."""
+    height, width = mask.shape
+    for y in range(height):
+        for x in range(width):
+            r = np.int64(rank[y, x])
+            if mask[y, x] and low <= r and r < high:
+                out[place[r - low]] = y * width + x
+                place[r - low] += 1
+
+
+@native
+def thin(mask: U8, order: I32, rank: U16) -> None:
+    """Take cells of a mask away in this order (places in the flat mask, nearest to obstacles first). Bit 1 marks
+    anchors, which stay."""
     width = mask.shape[1]
-    flat, key = mask.ravel(), far.ravel()
+    flat, key = mask.ravel(), rank.ravel()
     step = np.empty(8, np.int64)
     for k in range(8):
         step[k] = _DY[k] * width + _DX[k]
@@ -153,20 +201,29 @@ def thin(mask: U8, order: I64, far: I32) -> int:
                 if flat[other] == 1 and key[other] <= now:
                     stack[size] = other
                     size += 1
-    # Anchors two cells wide: those can go that are no ends.
-    left = np.empty(len(order), np.int64)
-    count = 0
-    for i in range(len(order)):
-        if flat[order[i]]:
-            flat[order[i]] = 1
-            left[count] = order[i]
-            count += 1
+
+
+@native
+def finish(mask: U8, order: I32) -> int:
+    """Make what is left one cell wide, and of zeros and ones; how many cells are left.
+
+    Anchors may be two cells wide: those go that are no ends. order: the cells that are left, as for ``thin``; it is
+    used up.
+    """
+    width = mask.shape[1]
+    flat = mask.ravel()
+    step = np.empty(8, np.int64)
+    for k in range(8):
+        step[k] = _DY[k] * width + _DX[k]
+    count = len(order)
+    for i in range(count):
+        flat[order[i]] = 1
     again = True
     while again:
         again = False
         n = 0
         for i in range(count):
-            cell = left[i]
+            cell = order[i]
             code = 0
             for k in range(8):
                 code |= flat[cell + step[k]] << k
@@ -174,7 +231,7 @@ def thin(mask: U8, order: I64, far: I32) -> int:
                 flat[cell] = 0
                 again = True
             else:
-                left[n] = cell
+                order[n] = cell
                 n += 1
         count = n
     return count
@@ -186,7 +243,12 @@ def compile_all() -> None:
     free[1:-1, 1:-1] = 1
     gap = np.zeros(free.shape, np.uint16)
     gaps(free, gap)
-    far, column = np.empty(free.shape, np.int32), np.empty(free.shape, np.int32)
-    nearest(gap, far, column)
-    anchors(free, gap, far, column)
-    thin(free, np.flatnonzero(free), far)
+    rank = np.empty(free.shape, np.uint16)
+    farthest(free, gap)
+    anchors(free, gap, 1.0, rank)
+    counts = np.zeros(65536, np.int64)
+    counted(free, rank, counts)
+    order = np.empty(int(counts.sum()), np.int32)
+    sorted_band(free, rank, 0, 65536, np.cumsum(counts) - counts, order)
+    thin(free, order, rank)
+    finish(free, np.flatnonzero(free).astype(np.int32))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,23 +109,46 @@ def skeleton(
     return without_islands(graph, where, island)
 
 
+BAND = 2**25
+"""Cells that are sorted at a time."""
+
+
 def ridges(mask: NDArray[np.uint8], gap: NDArray[np.uint16]) -> int:
     """Thin a mask in place to the generalised Voronoi diagram; how many cells are left.
 
-    It takes 8 bytes a cell, and 16 to 20 for each that is set.
+    It takes 2 bytes a cell, and some for those that are left: cells are sorted by their distance a part at a time.
     """
     from app.derive import _kernels_voronoi as kernels
 
-    far, column = np.empty(mask.shape, np.int32), np.empty(mask.shape, np.int32)
-    kernels.nearest(gap, far, column)
-    kernels.anchors(mask, gap, far, column)
-    del column
-    cells = np.flatnonzero(mask)
-    away = np.sqrt(far.ravel()[cells].astype(np.float32))
-    # In 16 bits, which NumPy sorts in linear time, a distance is exact to 1/65535 of the largest.
-    rank = (away * np.float32(65535.0 / max(float(away.max(initial=1.0)), 1.0))).astype(np.uint16)
-    del away
-    return int(kernels.thin(mask, cells[np.argsort(rank, kind="stable")], far))
+    rank = np.empty(mask.shape, np.uint16)
+    # In 16 bits a distance is exact to 1/65535 of the largest; below 181 cells no two different ones are the same.
+    largest = np.sqrt(np.float32(kernels.farthest(mask, gap)))
+    kernels.anchors(mask, gap, 65535.0 / max(float(largest), 1.0), rank)
+    for order in _by_rank(mask, rank, BAND):
+        kernels.thin(mask, order, rank)
+    left = np.concatenate([*_by_rank(mask, rank, BAND), np.empty(0, np.int32)])
+    return int(kernels.finish(mask, left))
+
+
+def _by_rank(mask: NDArray[np.uint8], rank: NDArray[np.uint16], most: int) -> Iterator[NDArray[np.int32]]:
+    """The set cells as places in the flat mask, sorted by rank, then place; about ``most`` at a time.
+
+    Those of higher ranks may not change meanwhile.
+    """
+    from app.derive import _kernels_voronoi as kernels
+
+    counts = np.zeros(2**16, np.int64)
+    kernels.counted(mask, rank, counts)
+    low = 0
+    while low < len(counts):
+        fit = int(np.searchsorted(np.cumsum(counts[low:]), most, side="right"))
+        high = low + max(1, fit)
+        here = counts[low:high]
+        if here.any():
+            order = np.empty(int(here.sum()), np.int32)
+            kernels.sorted_band(mask, rank, low, high, np.cumsum(here) - here, order)
+            yield order
+        low = high
 
 
 def without_islands(graph: Graph, where: Space, island: float) -> tuple[Graph, int]:

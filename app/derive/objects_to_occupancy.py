@@ -30,8 +30,8 @@ COARSER = (RESOLUTION, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 EASY = 2**25
 """Cells up to which the usual resolution is kept."""
 
-MOST = 2**28
-"""Cells of a grid whatever was asked for (``Limits.pixels``)."""
+MOST = 2**29
+"""Cells of a grid whatever was asked for: a byte each, and twice that while it is made."""
 
 LONGEST = 32767
 """Cells along a side: beyond it Nav2's map_server refuses the map."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from app.derive import Notes, derives
 from app.derive._grids import called, chosen
 from app.errors import CannotConvert, Invalid, Problem, TooLarge
-from app.model.features import Features, Properties, from_columns, points
+from app.model.features import Compact, Features, Properties, from_columns, points
 from app.model.grid import OccupancyGrid
 from app.model.layers import NETWORK, Layers, Part, PartKey
 from app.parameters import parameter
@@ -41,9 +41,6 @@ BELONGS: Mapping[str, tuple[str, ...]] = {
     "seed": ("roadmap",),
 }
 """Parameters that not every method has."""
-
-VORONOI_CELLS = 2**27
-"""Cells of the box around a grid's free cells of which a Voronoi diagram is made: it takes 12 to 30 bytes each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +149,9 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: s
             f"{called} leaves {where.cells} cells to a robot of radius {parameters.robot_radius:g} m, too few for a "
             f"way between two places: give a smaller robot_radius, more samples, or a grid of more than one spot"
         )
-    return _features(grid, where, graph)
+    row, column, width = where.row, where.column, _widths(where, graph)
+    del where  # three bytes a cell, which the features may need
+    return _features(grid, row, column, graph, width)
 
 
 def _check(parameters: Parameters) -> None:
@@ -186,11 +185,6 @@ def _space(grid: OccupancyGrid, parameters: Parameters, called: str) -> Space:
             f"or the network itself"
         )
     where = _skeleton.space(free, row, column, parameters.robot_radius / grid.resolution)
-    if parameters.method == "voronoi" and where.mask.size > VORONOI_CELLS:
-        raise TooLarge(
-            f"{called} has free space on {where.mask.size} cells, method=voronoi takes at most {VORONOI_CELLS}: "
-            "ask for method=skeleton, or upload a coarser grid"
-        )
     if not where.cells:
         widest = _skeleton.widest(where) * grid.resolution
         raise CannotConvert(
@@ -208,26 +202,32 @@ def _phase(grid: OccupancyGrid, where: Space, spacing: float) -> tuple[float, fl
     return (-(across + where.row) % spacing, -(along + where.column) % spacing)
 
 
-def _features(grid: OccupancyGrid, where: Space, graph: Graph) -> Features:
-    """Nodes, then edges, both ways each."""
+def _widths(where: Space, graph: Graph) -> NDArray[np.float64]:
+    """The free width along each edge, in cells."""
     from app.derive import _kernels_space
 
-    x, y, yaw = grid.origin
-    c, s = math.cos(yaw), math.sin(yaw)
-    u = (graph.nodes[:, 1] + where.column + 0.5) * grid.resolution
-    v = (graph.nodes[:, 0] + where.row + 0.5) * grid.resolution
-    xy = np.round(np.stack([x + c * u - s * v, y + s * u + c * v], axis=1), 9) + 0.0
-    names = _names(xy)
     width = np.empty(len(graph.edges))
     _kernels_space.widths(where.gap, graph.nodes, graph.edges, width)
+    return width
+
+
+def _features(grid: OccupancyGrid, row: int, column: int, graph: Graph, width: NDArray[np.float64]) -> Features:
+    """Nodes, then edges, both ways each. row, column: the grid's cell at which the graph's (0, 0) lies."""
+    x, y, yaw = grid.origin
+    c, s = math.cos(yaw), math.sin(yaw)
+    u = (graph.nodes[:, 1] + column + 0.5) * grid.resolution
+    v = (graph.nodes[:, 0] + row + 0.5) * grid.resolution
+    xy = np.round(np.stack([x + c * u - s * v, y + s * u + c * v], axis=1), 9) + 0.0
+    names = _names(xy)
     metres = np.round(np.concatenate([width, width]) * grid.resolution, 6).tolist()
     ends = np.concatenate([graph.edges, graph.edges[:, ::-1]])
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     ends, metres = ends[order], [metres[k] for k in order]
     pairs = [(names[a], names[b]) for a, b in ends.tolist()]
-    properties: list[Properties] = [{"kind": "node", "name": n} for n in names]
+    compact = Compact()
+    properties: list[Properties] = [compact({"kind": "node", "name": n}) for n in names]
     properties += [
-        {"kind": "edge", "source": a, "target": b, "width": w} for (a, b), w in zip(pairs, metres, strict=True)
+        compact({"kind": "edge", "source": a, "target": b, "width": w}) for (a, b), w in zip(pairs, metres, strict=True)
     ]
     lines = np.asarray(shapely.linestrings(xy[ends]), object)
     geometry = np.concatenate([points(xy), lines])

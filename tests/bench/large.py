@@ -24,6 +24,7 @@ from app.formats import Limits
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
 from app.model.voxels import LOG_ODDS, VoxelMap, morton
+from tests.bench.memory import peak, reset, resident
 
 SEED = 2026
 TEXT_TIMES, RASTER_TIMES = 10.0, 3.0
@@ -317,12 +318,6 @@ def measure(name: str, folder: Path) -> dict[str, Any]:
     }
 
 
-def _memory(field_: str) -> int:
-    """Bytes of a line of /proc/self/status."""
-    text = Path("/proc/self/status").read_text()
-    return next(int(line.split()[1]) for line in text.splitlines() if line.startswith(field_)) * 1024
-
-
 def _child(name: str, folder: Path, files: list[str]) -> None:
     case = CASES[name]
 
@@ -334,12 +329,12 @@ def _child(name: str, folder: Path, files: list[str]) -> None:
     for file, data in case.make(SMALL).items():
         (small / file).write_bytes(data)
     convert({file: small / file for file in files})
-    idle = _memory("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
+    idle = resident()
+    reset()
     start = time.perf_counter()
     convert({file: folder / file for file in files})
     spent = time.perf_counter() - start
-    print(json.dumps({"ms": spent * 1e3, "peak": _memory("VmHWM") - idle}))
+    print(json.dumps({"ms": spent * 1e3, "peak": peak() - idle}))
 
 
 if __name__ == "__main__":

@@ -5,6 +5,9 @@ from __future__ import annotations
 import pytest
 
 from app.convert import offline
+from app.model.features import Features
+from app.model.grid import OccupancyGrid
+from tests.bench import derived
 from tests.bench.large import CASES, SMALL
 
 
@@ -16,3 +19,15 @@ def test_a_made_up_map_converts(name: str) -> None:
     made = offline(files, case.to, datum=case.datum, options=case.options)
     assert made.files
     assert not [w for w in made.report["warnings"] if "left out" in w["problem"]]
+
+
+@pytest.mark.parametrize("name", sorted(derived.CASES))
+def test_a_made_up_site_derives(name: str) -> None:
+    made = derived.run(derived.CASES[name], derived.SMALL)
+    (part,) = made.parts.values()
+    if isinstance(part, OccupancyGrid):
+        assert part.cells.shape == pytest.approx((derived.HEIGHT * derived.SMALL, derived.WIDTH * derived.SMALL), abs=4)
+        assert part.counts()["free"] > 0
+    else:
+        assert isinstance(part, Features)
+        assert len(part) > 20

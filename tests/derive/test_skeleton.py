@@ -95,12 +95,35 @@ def test_distances_to_the_nearest_obstacle_are_exact() -> None:
         free = np.pad(mask.astype(np.uint8), 1)
         gap = np.zeros(free.shape, np.uint16)
         space_kernels.gaps(free, gap)
-        far, column = np.zeros(free.shape, np.int32), np.zeros(free.shape, np.int32)
-        voronoi_kernels.nearest(gap, far, column)
+        far, column = np.zeros(free.shape, np.int64), np.zeros(free.shape, np.int64)
+        at, until = np.zeros(free.shape[1], np.int64), np.zeros(free.shape[1] + 1)
+        for y in range(len(free)):
+            voronoi_kernels.envelope(gap, y, at, until, far[y], column[y])
+        assert voronoi_kernels.farthest(free, gap) == far.max()
         assert np.allclose(np.sqrt(far), ndimage.distance_transform_edt(free))
         rows = np.arange(len(free))[:, None]
         across = np.arange(free.shape[1])[None, :] - column
         assert (across**2 + gap[rows, column].astype(np.int64) ** 2 == far).all()
+
+
+@pytest.mark.parametrize("band", [1, 50, 700])
+def test_a_diagram_made_in_parts_is_the_same(band: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = masks(60)
+    whole = [ridges(mask) for mask in known]
+    monkeypatch.setattr(_skeleton, "BAND", band)
+    for mask, diagram in zip(known, whole, strict=True):
+        assert (ridges(mask) == diagram).all()
+
+
+def test_cells_come_by_rank_and_place_about_as_many_at_a_time_as_asked() -> None:
+    random = np.random.default_rng(3)
+    mask, rank = (random.random((40, 50)) < 0.6).astype(np.uint8), random.integers(0, 65536, (40, 50)).astype(np.uint16)
+    rank[:20] = 7  # more than a part holds
+    parts = list(_skeleton._by_rank(mask, rank, 100))
+    places = np.flatnonzero(mask)
+    assert np.concatenate(parts).tolist() == places[np.argsort(rank.ravel()[places], kind="stable")].tolist()
+    assert sorted(map(len, parts))[-2:] <= [100, int(mask[:20].sum()) + 100]
+    assert len(parts) > 5
 
 
 def test_random_masks_keep_their_topology_as_the_library_keeps_it() -> None:
