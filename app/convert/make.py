@@ -98,6 +98,7 @@ def write(
     lines = _told(used, layers, way, entries or {}, origin or {}, noted)
     context.attribution = tuple(sorted(credits_of(lines)))  # whichever part came first: equal content, equal bytes
     files = formats.write(known, used, context)
+    _warn_of_blocked(known, used, context)
     known_lines = {(line["layer"], line["level"], line["name"]) for line in lines}
     lines += [line for line in inner if (line["layer"], line["level"], line["name"]) not in known_lines]
     report = {
@@ -110,6 +111,26 @@ def write(
         "warnings": [p.as_dict() for p in notes.warnings + context.warnings],
     }
     return Written(files, report)
+
+
+UNPLANNED = frozenset({"geojson", "kml", "kmz"})
+"""Formats that people and programs look at, and no robot plans on: they say that an edge is blocked."""
+
+
+def _warn_of_blocked(known: Format, used: Layers, context: WriteContext) -> None:
+    """Say that a blocked edge is open to whoever plans on this map: no format's planner reads of such an edge.
+
+    (RMF's and Nav2's close lanes at run time, by a message to the fleet adapter or the route server.)
+    """
+    if known.holds or known.name in UNPLANNED:  # a folder's inner maps say it themselves
+        return
+    networks = used.vector("topology").values()
+    blocked = sum(p.get("kind") == "edge" and p.get("blocked") is True for part in networks for p in part.properties)
+    if blocked:
+        context.warn(
+            f"{blocked} edges are blocked for the time being, and {known.name} has no word for it that planners obey: "
+            "robots that plan on this map must be told of them otherwise"
+        )
 
 
 def from_layers(
