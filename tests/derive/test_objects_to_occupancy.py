@@ -261,7 +261,7 @@ def test_a_town_gets_coarser_cells_and_absurd_wishes_are_refused() -> None:
     g = grid(town, notes)
     assert g.resolution == 1.0
     assert notes.template[0]["what"] == "resolution"
-    with pytest.raises(CannotConvert, match=r"the limit is 268435456 cells .* resolution of at least 0\.18"):
+    with pytest.raises(CannotConvert, match=r"the limit is 536870912 cells .* resolution of at least 0\.13"):
         grid(town, resolution=0.01)
     world = layers(objects(house, (shapely.box(9e6, 9e6, 9e6 + 1, 9e6 + 1), {"kind": "wall"})))
     with pytest.raises(CannotConvert, match="ask for a resolution"):
