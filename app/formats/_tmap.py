@@ -711,7 +711,7 @@ class _Writer:
                 plain += 1
                 text = f"{a} {_yaml.text(i)}\n{b} {to}\n{c}"
             else:
-                text = self._edge(p, i, to)
+                i, text = self._edge(p, i, to)  # noqa: PLW2901  by the id that is written: read again, the order stays
             edges[source].append((len(i), i, text))
         self.filled["edges"] += plain
         self.dropped["items that are neither a node nor an edge from a node"] += lost
@@ -737,8 +737,8 @@ class _Writer:
         node = own.get("node") if isinstance(own, dict) else None
         return self.turn is not None and isinstance(node, dict) and node.get("parent_frame") == self.turn.child
 
-    def _edge(self, p: Properties, i: str, target: str) -> str:
-        """The text of an edge. target: its target's name as YAML."""
+    def _edge(self, p: Properties, i: str, target: str) -> tuple[str, str]:
+        """The id as it is written, and the text of an edge. target: its target's name as YAML."""
         own, action = p.get(NAME), p.get("action")
         rest: dict[str, Any] = own if isinstance(own, dict) else {}
         if "edge_id" in rest:
@@ -752,7 +752,7 @@ class _Writer:
         pieces = self.templates.get(key)
         if pieces is None:
             pieces = self.templates[key] = self._edge_template(rest, action, more, fill=fill)
-        return f"{pieces[0]} {_yaml.text(i)}\n{pieces[1]} {target}\n{pieces[2]}"
+        return i, f"{pieces[0]} {_yaml.text(i)}\n{pieces[1]} {target}\n{pieces[2]}"
 
     def _edge_template(
         self, rest: Mapping[str, Any], action: Any, more: dict[str, Any] | None, *, fill: bool

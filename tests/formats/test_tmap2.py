@@ -506,6 +506,18 @@ def test_the_order_of_items_does_not_matter() -> None:
         assert write(Layers({NETWORK: part.take(order)}))[0] == served
 
 
+def test_equal_edge_ids_stay_in_one_order() -> None:
+    said = yaml.safe_load(two("B", "A"))
+    said["nodes"][0]["node"]["edges"] = [
+        {"edge_id": "gg", "node": "A", "action": "x"},
+        {"edge_id": "f", "node": "A", "action": "x"},
+    ]
+    said["nodes"][1]["node"]["edges"] = [{"edge_id": "f", "node": "B", "action": "x"}]
+    served, _ = again(read(yaml.safe_dump(said))[0])
+    assert [e["edge_id"] for e in yaml.safe_load(served)["nodes"][1]["node"]["edges"]] == ["f", "gg"]
+    assert again(read(served)[0])[0] == served
+
+
 def test_small_and_large_numbers_are_numbers_for_pyyaml() -> None:
     rows = [("A", shapely.Point(1e-9, 9999999.123456789), {"kind": "node", "orientation": [1e-20, 0.0, 1.5e-7, 1.0]})]
     served, _ = write(Layers({NETWORK: features(rows, "local")}))
