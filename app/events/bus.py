@@ -29,7 +29,7 @@ from app.events.security import Security
 
 log = logging.getLogger(__name__)
 
-HISTORY = 64
+HISTORY = 256
 """Events of each environment that late joiners get, and that outlast a router's absence."""
 
 PUBLISHERS = 4096

@@ -30,7 +30,7 @@ POLL_SECONDS = 1.0
 """How often the database is asked all the same (another host may have committed), and the session looked after."""
 
 PAGE = 500
-REPLAYED_ENVIRONMENTS = 1000
+REPLAYED_ENVIRONMENTS = 250
 """At a start the last events of so many environments fill the publishers' caches again."""
 
 STATE_FILE = "events.json"
