@@ -13,6 +13,7 @@ from app.agent import hooks
 from tests.agent.conftest import Start, network
 from tests.api import samples
 from tests.api.conftest import Api
+from tests.events.conftest import eventually
 
 ROS2 = r"""#!/bin/sh
 printf '%s\n' "$*" >> "$ROS_LOG"
@@ -123,8 +124,14 @@ def test_a_hanging_hook_is_ended(tmp_path: Path) -> None:
     assert told is not None
     assert "took more than 0.5 seconds" in told
     pid = int((tmp_path / "pid").read_text())
-    state = Path(f"/proc/{pid}/stat")
-    assert not state.exists() or " Z " in state.read_text()
+    eventually(lambda: _ended(pid))  # what was killed takes a moment to end on a busy machine
+
+
+def _ended(pid: int) -> bool:
+    try:
+        return " Z " in Path(f"/proc/{pid}/stat").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return True
 
 
 def test_an_agent_switches_nav2(api: Api, place: str, robot: Start, ros: Path) -> None:
