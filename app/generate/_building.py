@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 import shapely
 
+from app.derive import Notes
 from app.errors import CannotGenerate
 from app.generate import Source
 from app.generate._place import Place, placed
-from app.generate._site import SLACK, Site, angle, mm, refused
+from app.generate._site import SLACK, Site, SiteOptions, angle, mm, refused
 from app.model.frame import GROUND, Level
+from app.model.layers import Layers
 
 FAMILY = "openrmf"
 WALL, PARTITION, SHELL = 0.12, 0.1, 0.24
@@ -559,3 +561,34 @@ def goal(room: Room, radius: float) -> tuple[float, float]:
     """A room's node: straight in from the door, so that there is place for furniture on both sides."""
     inward = max(radius + 0.9, 0.42 * room.depth)
     return room.door - room.box[0], min(inward, room.depth - radius - 0.5)
+
+
+def raised(
+    given: Layers,
+    options: SiteOptions,
+    measures: Storeys,
+    source: Source,
+    notes: Notes,
+    kinds: Kinds,
+    furnish: Callable[[Furniture, Room, np.random.Generator], None] | None,
+    charged: Callable[[int, Room], bool],
+) -> Layers:
+    """A whole building with its network. kinds: see ``build``. furnish: puts a room's things, None: it stays empty.
+    charged: whether a room (of the level of that number) has a charger for robots."""
+    check(measures, options.robot_radius)
+    site = Site(given, options, notes, levels=levels_of(measures))
+
+    def node_of(room: Room) -> tuple[float, float]:
+        return goal(room, options.robot_radius)
+
+    building = build(site, measures, options.robot_radius, source, kinds, node_of)
+    for k, level in enumerate(names_of(measures.levels)):
+        chance = source.stream(f"furniture/{k}")
+        for room in (room for room in building.rooms if room.level == level):
+            things = building.furnish(room, node_of(room))
+            if charged(k, room):
+                building.charger(things, node_of(room))
+            if furnish is not None:
+                furnish(things, room, chance)
+    slow_zones(building)
+    return site.finish(ground="grass")

@@ -9,7 +9,7 @@ import numpy as np
 from app.derive import Notes
 from app.generate import Source, _building, generates
 from app.generate._building import Furniture, Room, Storeys
-from app.generate._site import Site, SiteOptions
+from app.generate._site import SiteOptions
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -46,23 +46,10 @@ def office(given: Layers, options: Options, source: Source, notes: Notes) -> Lay
         options.levels, options.length, options.depth, options.corridor, least, most, options.door_width,
         options.storey_height, lift,
     )  # fmt: skip
-    _building.check(measures, options.robot_radius)
-    site = Site(given, options, notes, levels=_building.levels_of(measures))
-
-    def node_of(room: Room) -> tuple[float, float]:
-        return _building.goal(room, options.robot_radius)
-
-    building = _building.build(site, measures, options.robot_radius, source, _kinds, node_of)
-    for k, level in enumerate(_building.names_of(options.levels)):
-        chance = source.stream(f"furniture/{k}")
-        for room in (room for room in building.rooms if room.level == level):
-            things = building.furnish(room, node_of(room))
-            if k == 0 and room.kind in CHARGED:
-                building.charger(things, node_of(room))
-            if options.furniture:
-                _FURNISH.get(room.kind, _desks)(things, room, chance)
-    _building.slow_zones(building)
-    return site.finish(ground="grass")
+    furnish = _furnish if options.furniture else None
+    return _building.raised(
+        given, options, measures, source, notes, _kinds, furnish, lambda k, room: k == 0 and room.kind in CHARGED
+    )
 
 
 def _kinds(level: int, side: int, widths: list[float], chance: np.random.Generator) -> list[str]:
@@ -151,3 +138,7 @@ _FURNISH = {
     "copy": _copy,
     "reception": _reception,
 }
+
+
+def _furnish(things: Furniture, room: Room, chance: np.random.Generator) -> None:
+    _FURNISH.get(room.kind, _desks)(things, room, chance)
