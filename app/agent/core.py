@@ -121,6 +121,8 @@ class Agent:
         self._preloaded: tuple[int, str, tuple[File, ...]] | None = None
         self._rejoined = False
         self._in_vain = 0
+        self._called = 0
+        self._behind = 0
 
     # --- outside ---
 
@@ -187,12 +189,14 @@ class Agent:
                     self._find_router()
                 good = self._sync_and_tell()
                 failures = 0 if good else failures + 1
+                # A server of several hosts may know for a moment less than its events say: look again, ever later.
+                self._behind = self._behind + 1 if good and self._mark < self._called else 0
                 vain = woken and before == (self._state.marks, self._said)
                 self._in_vain = self._in_vain + 1 if vain else 0
             except Stopped:
                 break
-            if failures:
-                pause = min(pause, FIRST_PAUSE_SECONDS * 2 ** min(20, failures - 1))
+            if failures or self._behind:
+                pause = min(pause, FIRST_PAUSE_SECONDS * 2 ** min(20, max(failures, self._behind) - 1))
             woken = self._rest(max(self._after, pause * random.uniform(0.5, 1.5)))  # noqa: S311  jitter is no secret
 
     # --- what wakes it ---
@@ -229,8 +233,7 @@ class Agent:
         if event.environment != self.options.environment or not isinstance(event.channel, str | None):
             return
         channel = self._state.channel
-        mark = self._state.marks.get(channel or "", (-1, ""))[0]
-        if event.sequence <= mark:
+        if event.sequence <= self._mark:
             return
         with self._lock:
             self._events[event.sequence] = event
@@ -244,7 +247,14 @@ class Agent:
         else:
             concerns = event.channel in ours or event.type.startswith("environment.")
         if concerns:
+            if event.type in ("version.created", "channel.moved"):
+                self._called = event.sequence
             self._wake.set()
+
+    @property
+    def _mark(self) -> int:
+        """The sequence that the channel is known to have reached."""
+        return self._state.marks.get(self._state.channel or "", (-1, ""))[0]
 
     def _back(self) -> None:
         self._tell("connected", detail="listening for events over Zenoh")

@@ -24,6 +24,9 @@ LOOK_SECONDS = 0.5
 """Between two looks whether the router is there."""
 
 CONNECT_MS = 5000
+RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
+"""How soon a session that lost its router tries again; Zenoh's own pauses grow to 4 s, in step for a whole fleet."""
+
 MAX_PAUSE_SECONDS = 30.0
 MAX_EVENT_BYTES = 2**18
 
@@ -184,6 +187,7 @@ def configuration(connect: str, file: Path | None = None, login: Login | None = 
         "connect/endpoints": [part.strip() for part in connect.split(",") if part.strip()],
         "connect/timeout_ms": CONNECT_MS,
         "connect/exit_on_failure": True,
+        **({} if file is not None else {"connect/retry": RETRY}),
         "listen/endpoints": [],
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,

@@ -53,7 +53,7 @@ def _one(here: Services, env: str, channel: Channel) -> dict[str, Any]:
 
 
 @router.get("", responses=told(list[ChannelOut], 404), summary="All channels")
-def list_channels(
+async def list_channels(
     env: EnvironmentPath,
     request: Request,
     here: Here,
@@ -67,15 +67,20 @@ def list_channels(
     `robots.since` is told where all robots of a channel hold its root: from then on they have. `holding`, `lagging` and
     `failed` make up the `total`; `ready` have what is planned.
     """
+    headers, data = await here.hot.shared(request, _listed, here, env, request, robots)
+    if none_match(request.headers.get("if-none-match"), headers["etag"]):
+        return Response(status_code=304, headers=headers)
+    return Response(data, 200, headers, "application/json")
+
+
+def _listed(here: Services, env: str, request: Request, robots: bool) -> tuple[dict[str, str], bytes]:
     generation, now = here.hot.generation(), datetime.now(UTC)
     fleet_of = here.store.robots(env) if robots else None
     data = json_bytes([as_dict(channel, fleet_of, now) for channel in here.store.channels(env)])
     headers = {"etag": f'"{hashlib.sha256(data).hexdigest()[:40]}"', "cache-control": "no-cache"}
     if not robots:  # this is what robots ask for, all of them at once
         here.hot.keep(request, env, headers, data, generation)
-    if none_match(request.headers.get("if-none-match"), headers["etag"]):
-        return Response(status_code=304, headers=headers)
-    return Response(data, 200, headers, "application/json")
+    return headers, data
 
 
 @router.put("/{channel}", responses=told(ChannelOut, 400, 404, 415), summary="Promote, roll back, or plan it")

@@ -5,16 +5,15 @@ Exact bytes of any format for the price of what changed: one moved node of a 400
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import binascii
 import sys
+import threading
 from collections import OrderedDict
 from collections.abc import Mapping
 from pathlib import Path
 
-from starlette.concurrency import run_in_threadpool
-
+from app.api.together import Together
 from app.convert.cache import Cache
 
 if sys.version_info >= (3, 14):
@@ -35,31 +34,28 @@ class Deltas:
     def __init__(self, cache: Cache, room: int = 64 * 2**20) -> None:
         self._cache, self._room, self._size = cache, room, 0
         self._known: OrderedDict[tuple[str, str], bytes | None] = OrderedDict()
-        self._running: dict[tuple[str, str], asyncio.Future[bytes | None]] = {}
+        self._running: Together[tuple[str, str], bytes | None] = Together()
+        self._lock = threading.Lock()
 
     async def between(self, old: str, new: str, body: bytes | Path) -> bytes | None:
         """``dcz`` of the new file (by its SHA-256) against an old one; None where the old one is not known, or the
         delta is not smaller than the file."""
         key = (old, new)
-        if key in self._known:
-            self._known.move_to_end(key)
-            return self._known[key]
-        running = self._running.get(key)
-        if running is None:
-            running = asyncio.ensure_future(run_in_threadpool(self._make, old, body))
-            self._running[key] = running
-            running.add_done_callback(lambda done: self._made(key, done))
-        return await asyncio.shield(running)
+        with self._lock:
+            if key in self._known:
+                self._known.move_to_end(key)
+                return self._known[key]
+        return await self._running.run(key, self._between, key, body)
 
-    def _made(self, key: tuple[str, str], done: asyncio.Future[bytes | None]) -> None:
-        self._running.pop(key, None)
-        if done.cancelled() or done.exception() is not None:
-            return
-        self._known[key] = done.result()
-        self._size += len(done.result() or b"") + 200
-        while self._size > self._room and len(self._known) > 1:
-            _, dropped = self._known.popitem(last=False)
-            self._size -= len(dropped or b"") + 200
+    def _between(self, key: tuple[str, str], body: bytes | Path) -> bytes | None:
+        made = self._make(key[0], body)
+        with self._lock:
+            self._known[key] = made
+            self._size += len(made or b"") + 200
+            while self._size > self._room and len(self._known) > 1:
+                _, dropped = self._known.popitem(last=False)
+                self._size -= len(dropped or b"") + 200
+        return made
 
     def _make(self, old: str, body: bytes | Path) -> bytes | None:
         before = self._cache.by_hash(old, MAX_BYTES)

@@ -11,15 +11,15 @@ import time
 from typing import Any
 from urllib.parse import urlsplit
 
-from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api import problems
-from app.api.access import environment_of, is_open
+from app.api.access import Principal, environment_of, is_open
 from app.api.answers import API
 from app.api.problems import MalformedBody, SlowBody, UnsupportedMedia
 from app.api.services import Services
+from app.api.together import Together
 from app.errors import Denied, FleetMapError, TooLarge
 
 MULTIPART_OVERHEAD = 2**20
@@ -47,6 +47,7 @@ class Guard:
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
+        self._checks: Together[tuple[bytes | None, str | None, int], Principal] = Together()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or pass it on."""
@@ -89,7 +90,8 @@ class Guard:
             principal = here.access.known(authorization)
             if principal is None:
                 client = scope["client"][0] if scope.get("client") else None
-                principal = await run_in_threadpool(here.access.check, authorization, client)
+                key = (authorization, client, here.hot.generation())
+                principal = await self._checks.run(key, here.access.check, authorization, client)
             environment = environment_of(scope["path"])
             if environment is not None:
                 principal.enter(environment)

@@ -76,17 +76,35 @@ async def get_manifest(
     is that of the event that brought the channel (or the version) there: a robot refuses a lower one.
     """
     names = _names(formats)
+    while True:
+        found = await here.hot.shared(request, _signed, here, env, v, names, request)
+        if not isinstance(found, Recipe):
+            break
+        outcome = await _made(here, found, request, who)
+        if isinstance(outcome, Started):
+            return started(outcome.job)
+    headers, data = found
+    if none_match(request.headers.get("if-none-match"), headers["etag"]):
+        return Response(status_code=304, headers=headers)
+    return Response(data, 200, headers, "application/json")
+
+
+def _signed(
+    here: Services, env: str, v: str, names: list[str], request: Request
+) -> tuple[dict[str, str], bytes] | Recipe:
+    """The headers and the signed bytes; the first map that is to be made before that can be said."""
     channel = None if isinstance(number_of(v), int) else v
     generation = here.hot.generation()
-    version, sequence = await run_in_threadpool(here.store.standing, env, number_of(v))
+    version, sequence = here.store.standing(env, number_of(v))
     files: list[dict[str, Any]] = []
     for name in names:
         seen: set[str] = set()
         for values in _variants(name, version):
-            outcome = await made_for(here, version, name, values, request, who)
-            if isinstance(outcome, Started):
-                return started(outcome.job)
-            for file in outcome.files:
+            recipe = here.maps.recipe(version, name, values)
+            made = here.maps.ready(recipe)
+            if made is None:
+                return recipe
+            for file in made.files:
                 if file.name not in seen:
                     seen.add(file.name)
                     files.append({"format": name, "name": file.name, "size": file.size, "sha256": file.sha256})
@@ -102,18 +120,15 @@ async def get_manifest(
         "expires": rfc3339(datetime.fromtimestamp(expires, UTC)),
         "files": sorted(files, key=lambda f: (f["format"], f["name"])),
     }
-    variables = await run_in_threadpool(here.maps.variables, version)
+    variables = here.maps.variables(version)
     if variables:
         body["variables"] = variables
     data = json_bytes(body)
     key, signature = here.keys.sign(data)
     signed = f"{key}:{base64.b64encode(signature).decode()}"
-    etag = f'"{signed[-40:-2]}"'
-    headers = {"etag": etag, "cache-control": "no-cache", SIGNATURE: signed}
+    headers = {"etag": f'"{signed[-40:-2]}"', "cache-control": "no-cache", SIGNATURE: signed}
     here.hot.keep(request, env, headers, data, generation)
-    if none_match(request.headers.get("if-none-match"), etag):
-        return Response(status_code=304, headers=headers)
-    return Response(data, 200, headers, "application/json")
+    return headers, data
 
 
 def _names(text: str) -> list[str]:
@@ -146,10 +161,17 @@ async def made_for(
     """A version's map in a format, with these options; the job where it takes long."""
     while True:
         recipe: Recipe = await run_in_threadpool(here.maps.recipe, version, name, values)
-        made = await run_in_threadpool(here.maps.ready, recipe)
+        made = await run_in_threadpool(here.maps.ready, recipe) or await _made(here, recipe, request, who)
         if made is not None:
             return made
-        try:
-            return await here.work.make(recipe, who, address_of(request))
-        except CannotDerive:
-            await asyncio.sleep(0)  # it is remembered: the next recipe goes another way, or says that there is none
+
+
+async def _made(here: Services, recipe: Recipe, request: Request, who: Any) -> Made | Started | None:
+    """A map that is not ready, or the job that makes it. None where it cannot be derived so: the next recipe goes
+    another way, or says that there is none.
+    """
+    try:
+        return await here.work.make(recipe, who, address_of(request))
+    except CannotDerive:
+        await asyncio.sleep(0)
+        return None

@@ -7,16 +7,15 @@ way: guard, route, recipe (the ETag), cache on disk, conversion.
 
 from __future__ import annotations
 
-import asyncio
 import re
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ParamSpec, TypeVar
 from urllib.parse import parse_qsl, quote, urlencode
 
 from fastapi import APIRouter, FastAPI, Query, Request
@@ -34,6 +33,7 @@ from app.api.jobs import Started, started
 from app.api.metrics import Metrics
 from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, told
 from app.api.services import Here, Services
+from app.api.together import Together
 from app.convert import Recipe
 from app.convert.cache import Made, MadeFile
 from app.errors import CannotDerive, Invalid, NotFound, Problem
@@ -46,6 +46,8 @@ IN_MEMORY = 8 * 2**20
 CHUNK = 256 * 2**10
 PRODUCTION = "production"
 
+T = TypeVar("T")
+P = ParamSpec("P")
 Headers = list[tuple[bytes, bytes]]
 Key = tuple[bytes, bytes]
 """Raw path and raw query."""
@@ -89,7 +91,7 @@ class Hot:
         self._limit, self._size = here_bytes, 0
         self.access, self._metrics, self.generation = access, metrics, generation
         self._entries: OrderedDict[Key, Resource] = OrderedDict()
-        self._resolving: dict[Key, asyncio.Future[Recipe]] = {}
+        self._looks: Together[tuple[Key, int, Any], Any] = Together()
         self._lock = threading.Lock()
         self._tallies: dict[str, list[int]] = {}
 
@@ -102,8 +104,7 @@ class Hot:
 
     async def find(self, request: Request, here: Services, who: Principal) -> Resource | Started:
         """What stands at the request's address; made where need be, or the job that makes it."""
-        scope = request.scope
-        key: Key = (scope.get("raw_path") or scope["path"].encode(), scope["query_string"])
+        key = _key(request)
         fresh = self.get(key)
         if fresh is not None and (fresh.body is not None or fresh.path is not None):
             return fresh
@@ -112,7 +113,7 @@ class Hot:
         # Taken before anything is read: a commit in between makes this answer stale, never fresh.
         generation, until = self.generation(), time.monotonic() + FRESH_SECONDS
         while True:
-            recipe = await self._recipe(key, here, wanted, values, derive)
+            recipe = await self.shared(request, _resolve, here, wanted, values, derive)
             old = self._entries.get(key)
             if old is not None and old.recipe is not None and _same(old.recipe, recipe) and old.body is not None:
                 fresh = replace(old, generation=generation, fresh_until=until)
@@ -122,37 +123,38 @@ class Hot:
             if _matches(request, empty.etag):
                 self._put(key, empty)
                 return empty
-            made = await run_in_threadpool(here.maps.ready, recipe)
-            if made is not None:
-                self._metrics.disk_hits.inc()
-                break
+            full = await self.shared(request, self._ready, here, key, empty)
+            if full is not None:
+                return full
             try:
                 outcome = await here.work.make(recipe, who, address_of(request))
             except CannotDerive:
                 continue  # it is remembered: the next recipe goes another way, or says that there is none
             if isinstance(outcome, Started):
                 return outcome
-            made = outcome
-            break
-        full = await run_in_threadpool(_filled, empty, made)
+            return await self.shared(request, self._fill, key, empty, outcome)
+
+    def _ready(self, here: Services, key: Key, empty: Resource) -> Resource | None:
+        assert empty.recipe is not None
+        made = here.maps.ready(empty.recipe)
+        if made is None:
+            return None
+        self._metrics.disk_hits.inc()
+        return self._fill(key, empty, made)
+
+    def _fill(self, key: Key, empty: Resource, made: Made) -> Resource:
+        full = _filled(empty, made)
         self._put(key, full)
         return full
 
-    async def _recipe(
-        self, key: Key, here: Services, wanted: Wanted, values: Mapping[str, str], derive: bool
-    ) -> Recipe:
-        """One look into the store for all who ask at the same moment."""
-        running = self._resolving.get(key)
-        if running is None:
-            running = asyncio.ensure_future(run_in_threadpool(_resolve, here, wanted, values, derive))
-            self._resolving[key] = running
-            running.add_done_callback(partial(self._resolved, key))
-        return await asyncio.shield(running)
+    async def shared(self, request: Request, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """What ``function`` finds, called in a thread: one look for all who ask for this address at the same moment.
 
-    def _resolved(self, key: Key, done: asyncio.Future[Recipe]) -> None:
-        self._resolving.pop(key, None)
-        if not done.cancelled():
-            done.exception()  # looked at by whoever waits; nobody may be left
+        Nobody joins a look that began before the last commit. What it finds must not depend on who asks.
+        """
+        key = (_key(request), self.generation(), function)
+        found: T = await self._looks.run(key, function, *args, **kwargs)
+        return found
 
     def _resource(
         self,
@@ -186,12 +188,11 @@ class Hot:
 
         generation: as it was before the store was asked. Whoever may enter the environment gets it.
         """
-        scope = request.scope
-        key: Key = (scope.get("raw_path") or scope["path"].encode(), scope["query_string"])
+        key = _key(request)
         bare = [(name.encode(), value.encode()) for name, value in headers.items()]
         full = [*bare, (b"content-length", str(len(body)).encode()), (b"content-type", b"application/json")]
         full.append((b"x-content-type-options", b"nosniff"))
-        tally = self._tallies.setdefault(scope["route"].path, [0, 0])
+        tally = self._tallies.setdefault(request.scope["route"].path, [0, 0])
         wanted, until, etag = Wanted(environment, None, "", None), time.monotonic() + FRESH_SECONDS, headers["etag"]
         self._put(
             key,
@@ -216,6 +217,11 @@ class Hot:
             self._entries[key] = resource
             while self._size > self._limit and len(self._entries) > 1:
                 self._size -= _weight(self._entries.popitem(last=False)[1])
+
+
+def _key(request: Request) -> Key:
+    scope = request.scope
+    return (scope.get("raw_path") or scope["path"].encode(), scope["query_string"])
 
 
 def _weight(resource: Resource) -> int:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Request
+from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import fleet
@@ -76,7 +78,7 @@ def get_robot(
     responses={**told(RobotOut, 400, 404, 409, 415, 503), 204: {"description": "Taken (`Prefer: return=minimal`)"}},
     summary="A robot says what it holds",
 )
-def put_status(
+async def put_status(
     robot: RobotPath,
     body: StatusBody,
     here: Here,
@@ -89,10 +91,14 @@ def put_status(
     if body.time is not None and body.time.tzinfo is None:
         raise Invalid("time needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="body.time")])
     report = Report(body.channel, body.version, body.root, body.state, body.detail, body.sequence, body.time)
+    # No thread waits for the store: a whole fleet reports at once, and others want maps meanwhile.
+    noting = here.fleet.noting(Heard(body.environment, robot, report, datetime.now(UTC)))
+    await asyncio.wait({asyncio.wrap_future(noting)}, timeout=fleet.NOTE_SECONDS)
+    fleet.settle(noting)
     if prefer is not None and prefer.strip().lower() == "return=minimal":
-        here.fleet.note(Heard(body.environment, robot, report, datetime.now(UTC)))
         return Response(status_code=204, headers={"preference-applied": "return=minimal"})
-    return answer(noted(here, body.environment, robot, report))
+    (as_it_is,) = await run_in_threadpool(lambda: _told(here, here.store.robots(body.environment, robot)))
+    return answer(as_it_is)
 
 
 @router.delete("/{robot}", status_code=204, responses=told(None, 404), summary="Forget a robot that is gone for good")

@@ -81,7 +81,7 @@ def fill_quietly(where: Path) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this process
     with contextlib.suppress(Exception):
         ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)  # it ends with the server, however that ends
-        os.nice(10)
+        os.nice(19)
         fill(where)
 
 

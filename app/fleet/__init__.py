@@ -4,8 +4,19 @@
 over the bus, in order, into the store.
 """
 
-from app.fleet.intake import Intake, report_of
+from app.fleet.intake import NOTE_SECONDS, Intake, report_of, settle
 from app.fleet.picture import Holding, Lag, holding, is_online, lag_of
 from app.fleet.rollout import decide
 
-__all__ = ["Holding", "Intake", "Lag", "decide", "holding", "is_online", "lag_of", "report_of"]
+__all__ = [
+    "NOTE_SECONDS",
+    "Holding",
+    "Intake",
+    "Lag",
+    "decide",
+    "holding",
+    "is_online",
+    "lag_of",
+    "report_of",
+    "settle",
+]

@@ -90,6 +90,10 @@ class Intake:
 
     def note(self, heard: Heard) -> None:
         """A report that came over HTTP: blocks until it is stored. Raises what the store has against it."""
+        settle(self.noting(heard), NOTE_SECONDS)
+
+    def noting(self, heard: Heard) -> Future[FleetMapError | None]:
+        """The same without waiting: what the store has against it comes as the future's result."""
         told: Future[FleetMapError | None] = Future()
         if self._thread is None or self._ending.is_set():
             raise Unavailable("the server is starting or stopping: try again in a few seconds")
@@ -97,12 +101,7 @@ class Intake:
             self._queue.put_nowait(_Said(heard, told))
         except queue.Full:
             raise Unavailable("too many reports of robots wait: try again in a few seconds") from None
-        try:
-            refused = told.result(NOTE_SECONDS)
-        except TimeoutError:
-            raise Unavailable("the report could not be stored in time: try again in a few seconds") from None
-        if refused is not None:
-            raise refused
+        return told
 
     def alive(self, robot: str, there: bool) -> None:
         """A robot's session came or went."""
@@ -187,6 +186,16 @@ class Intake:
         with self._lock:
             self._new -= there
             self._gone -= gone
+
+
+def settle(told: Future[FleetMapError | None], seconds: float = 0.0) -> None:
+    """Raise what the store had against a report; Unavailable where it did not say within so many seconds."""
+    try:
+        refused = told.result(seconds)
+    except TimeoutError:
+        raise Unavailable("the report could not be stored in time: try again in a few seconds") from None
+    if refused is not None:
+        raise refused
 
 
 def _tell(said: _Said, refused: FleetMapError | None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from sqlalchemy.engine import make_url
 from app.errors import Invalid, Unavailable
 
 BUSY_MILLISECONDS = 5000
+TURN_SECONDS = 30.0
 
 
 def engine(url: str, *, readonly: bool) -> Engine:
@@ -83,6 +85,8 @@ class Database:
         self.engine = engine(url, readonly=readonly)
         self._written = written
         self.sqlite = self.engine.dialect.name == "sqlite"
+        # SQLite lets whoever happens to look at the right moment write: among many, one may never come to it.
+        self._turn = threading.Lock()
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
@@ -101,12 +105,25 @@ class Database:
     @contextmanager
     def write(self, *, tell: bool = True) -> Iterator[Connection]:
         """A transaction that writes: all or nothing, and on disk when it ends. tell: whether caches are to know."""
-        with translated(), self.engine.connect() as connection:
+        with self._in_turn(), translated(), self.engine.connect() as connection:
             connection.execution_options(write=True)
             with connection.begin():
                 yield connection
         if tell:
             self._written()
+
+    @contextmanager
+    def _in_turn(self) -> Iterator[None]:
+        """One writer of this process after the other, where the database lets only one write."""
+        if not self.sqlite:
+            yield
+            return
+        if not self._turn.acquire(timeout=TURN_SECONDS):
+            raise Unavailable("too much is being written: try again in a few seconds")
+        try:
+            yield
+        finally:
+            self._turn.release()
 
     def close(self) -> None:
         """Give back all connections."""
