@@ -30,7 +30,7 @@ lint: install-dev
 bench: install-dev
 	@$(BIN)/python -m tests.bench $(ARGS)
 
-# Kills of the server, the router and the database at random moments: 50 of each; `make test` does 6.
+# Kills of the server, the router and the database at random moments: 50 of each; `make test` does 10.
 chaos: install-dev
 	@FLEETMAP_CHAOS=$${FLEETMAP_CHAOS:-50} $(BIN)/python -m pytest -s tests/chaos $(ARGS)
 

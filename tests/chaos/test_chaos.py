@@ -1,6 +1,6 @@
 """kill -9 of server, router and database at random moments, in the middle of commits, of the relay and of downloads.
 
-Each is killed FLEETMAP_CHAOS times (6, ``make chaos``: 50), shared out to two worlds: PostgreSQL with the server's own
+Each is killed FLEETMAP_CHAOS times (10, ``make chaos``: 50), shared out to two worlds: PostgreSQL with the server's own
 router, and SQLite with a separate router. FLEETMAP_CHAOS_SEED names another order of moments.
 """
 
@@ -21,7 +21,7 @@ from tests.postgres import Cluster, postgres_cluster
 
 __all__ = ["postgres_cluster"]
 
-KILLS = int(os.environ.get("FLEETMAP_CHAOS", "6"))
+KILLS = int(os.environ.get("FLEETMAP_CHAOS", "10"))
 SEED = int(os.environ.get("FLEETMAP_CHAOS_SEED", "5"))
 SECONDS_A_KILL = 30
 
