@@ -231,7 +231,7 @@ def main() -> int:
         help="one of the tables",
     )
     arguments = parser.parse_args()
-    if not DATA.is_dir() and arguments.only not in ("events", "generate", "large", "derived"):
+    if not DATA.is_dir() and arguments.only not in ("generate", "large", "derived"):
         print("the real maps are not beside the checkout (../shared/data): nothing to measure", file=sys.stderr)
         return 2
     converted = conversions(arguments.tries) if arguments.only in (None, "conversions") else []

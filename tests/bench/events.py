@@ -31,7 +31,7 @@ from app.events import messages
 from app.events.bus import BusOptions, router_configuration
 from app.events.router import Router
 from app.store.generation import Generation
-from tests.bench import http
+from tests.bench import changes, http
 
 SESSIONS = 100
 COMMITS = 30
@@ -41,6 +41,7 @@ ALLOWED_MS = 20.0
 CONVERGED_SECONDS = 10.0
 TOKEN = "bench-" + "0" * 40
 ENVIRONMENT = "field"
+SHARED = Path(__file__).resolve().parents[3] / "shared"
 
 
 def network(moved: float = 0.0, count: int = 100) -> bytes:
@@ -380,9 +381,47 @@ def conversions(client: httpx.Client) -> int:
     return int(float(found[1])) if found else 0
 
 
+# --- what a change costs a robot --------------------------------------------------------------------------------------
+
+
+def costs() -> list[dict[str, Any]]:
+    """Bytes for small changes of a real site."""
+    port, zenoh_port = http.free_port(), http.free_port()
+    with tempfile.TemporaryDirectory() as folder, served(Path(folder), port, zenoh_port) as client:
+
+        def upload(env: str, files: dict[str, bytes]) -> None:
+            client.post("/api/v1/environments", json={"name": env})
+            sent = [("files", item) for item in files.items()]
+            client.post(f"/api/v1/environments/{env}/versions", files=sent).raise_for_status()
+
+        server = f"http://127.0.0.1:{port}"
+        node = changes.moved_node(SHARED, upload, server, TOKEN)
+        block, picture = changes.changed_block(SHARED, upload, server, TOKEN)
+    return [
+        {
+            "what": "a moved node of a network of 382 kB, to a robot",
+            "peer": None,
+            "ours": node,
+            "unit": "B",
+            "ratio": None,
+            "bound": "≤ 1000 B",
+            "holds": node <= 1000,
+        },
+        {
+            "what": "a block of 400 × 400 of 4000 × 4000 cells, to a robot (peer: the PNG)",
+            "peer": picture,
+            "ours": block,
+            "unit": "B",
+            "ratio": block / picture,
+            "bound": "≤ 0.15",
+            "holds": block <= 0.15 * picture,
+        },
+    ]
+
+
 def rows() -> list[dict[str, Any]]:
     """All of it."""
-    return [*latency(), *convergence()]
+    return [*costs(), *latency(), *convergence()]
 
 
 def _until(condition: Any, seconds: float = 60.0) -> None:

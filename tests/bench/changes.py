@@ -1,0 +1,70 @@
+"""Small changes to a real site, and what a robot takes in for them: all bodies that its agent receives in one sync."""
+
+from __future__ import annotations
+
+import io
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from app.agent.core import Agent, Options
+
+FARM = "data/environment_template/riseholme_park_farm_strawberry_polytunnels/config"
+
+Upload = Callable[[str, dict[str, bytes]], Any]
+"""(environment, files): makes a version; of an environment that is new, the environment too."""
+
+
+def moved_node(shared: Path, upload: Upload, server: str, token: str) -> int:
+    """One node of the strawberry polytunnels' network is moved by 25 cm: bytes."""
+    network = (shared / FARM / "topological/network.tmap2.yaml").read_bytes()
+    found = list(re.finditer(rb"\n      position:\n        x: (\S+)", network))
+    x = found[len(found) // 2]
+    moved = network[: x.start(1)] + f"{float(x[1]) + 0.25:.6f}".encode() + network[x.end(1) :]
+    before, after = {"network.tmap2.yaml": network}, {"network.tmap2.yaml": moved}
+    return _cost("moved-node", "tmap2", before, after, upload, server, token)
+
+
+def changed_block(shared: Path, upload: Upload, server: str, token: str) -> tuple[int, int]:
+    """A solid block of 400 × 400 cells in the polytunnels' grid of 4000 × 4000: bytes, and those of its new PNG."""
+    folder = shared / FARM / "metric/map"
+    described, picture = (folder / "map.yaml").read_bytes(), (folder / "map.png").read_bytes()
+    cells = np.array(Image.open(io.BytesIO(picture)).convert("L"))
+    if cells.shape != (4000, 4000):
+        raise RuntimeError(f"the grid has {cells.shape} cells")
+    cells[1800:2200, 1500:1900] = 0
+    changed = io.BytesIO()
+    Image.fromarray(cells).save(changed, "PNG")
+    new = changed.getvalue()
+    before, after = {"map.yaml": described, "map.png": picture}, {"map.yaml": described, "map.png": new}
+    return _cost("changed-block", "occupancy_grid", before, after, upload, server, token), len(new)
+
+
+def _cost(
+    env: str, kind: str, before: dict[str, bytes], after: dict[str, bytes], upload: Upload, server: str, token: str
+) -> int:
+    said: list[tuple[str, dict[str, Any]]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        options = Options(server=server, environment=env, formats=(kind,), into=Path(folder) / "robot", token=token)
+        upload(env, before)
+        agent = Agent(options, lambda what, **more: said.append((what, more)))
+        agent.open()
+        try:
+            _sync(agent, said)
+            upload(env, after)
+            return _sync(agent, said)
+        finally:
+            agent.close()
+
+
+def _sync(agent: Agent, said: list[tuple[str, dict[str, Any]]]) -> int:
+    received = agent._web.received
+    said.clear()
+    if not agent.once() or not any(what == "switched" for what, _ in said):
+        raise RuntimeError(f"the agent has not switched: {said}")
+    return agent._web.received - received
