@@ -21,7 +21,7 @@ def roadmap(
     nodes of the skeleton, so that what the skeleton connects is connected; samples in places that the skeleton leaves
     out, and those that see neither it nor another sample, are left out; how many is told.
     """
-    from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+    from scipy.spatial import cKDTree
 
     random = np.random.default_rng(seed)
     middle = _along(skeleton, where, samples // 2, random)
@@ -61,8 +61,8 @@ def _anywhere(where: Space, count: int, random: np.random.Generator) -> NDArray[
 
 def _joined(graph: Graph, skeleton: Graph, where: Space) -> tuple[Graph, int]:
     """The roadmap with what of the skeleton is needed to join its pieces, without what nothing can join."""
-    from scipy.sparse import coo_array  # type: ignore[import-untyped]
-    from scipy.sparse.csgraph import minimum_spanning_tree  # type: ignore[import-untyped]
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import minimum_spanning_tree
     from scipy.spatial import cKDTree
 
     n, more = len(graph.nodes), len(skeleton.nodes)

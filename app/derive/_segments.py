@@ -344,7 +344,7 @@ class _Work:
     def _wood(self, mask: NDArray[np.bool_], at: tuple[slice, slice]) -> None:
         """A piece of wood: crowns where it falls into round ones, else vegetation."""
         import cv2
-        from scipy.ndimage import find_objects  # type: ignore[import-untyped]
+        from scipy.ndimage import find_objects
 
         padded = np.pad(mask, 1).astype(np.uint8)
         away = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_5)

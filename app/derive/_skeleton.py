@@ -176,8 +176,8 @@ def without_islands(graph: Graph, where: Space, island: float) -> tuple[Graph, i
 
 def pieces(graph: Graph) -> tuple[int, NDArray[np.int64]]:
     """How many connected pieces a graph has, and which one each node is in."""
-    from scipy.sparse import coo_array  # type: ignore[import-untyped]
-    from scipy.sparse.csgraph import connected_components  # type: ignore[import-untyped]
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
 
     n = len(graph.nodes)
     if not n:
@@ -272,7 +272,7 @@ def divided(graph: Graph, where: Space, spacing: float) -> Graph:
 
 def _lattice(graph: Graph, where: Space, spacing: float, phase: tuple[float, float]) -> NDArray[np.int64]:
     """Cells of the space on a square lattice that are not near to a node already."""
-    from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+    from scipy.spatial import cKDTree
 
     rows, columns = (
         np.unique(np.rint(np.arange(begin % spacing, size - 1, spacing)).astype(np.int64))

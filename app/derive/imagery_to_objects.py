@@ -79,8 +79,8 @@ def _regions(found: Segments, on: Ground, parameters: Parameters) -> list[Row]:
 
 def polygons(label: NDArray[np.int32], transform: Any, tolerance: float) -> dict[int, Any]:
     """The area of each label, simplified, in metres."""
-    from rasterio.features import shapes  # type: ignore[import-untyped]
-    from rasterio.transform import Affine  # type: ignore[import-untyped]
+    from rasterio.features import shapes
+    from rasterio.transform import Affine
 
     found: dict[int, list[Any]] = {}
     for geometry, value in shapes(label, mask=label > 0, connectivity=4, transform=Affine(*transform)):

@@ -198,8 +198,8 @@ def _burn(cells: NDArray[np.uint8], frame: _Frame, shapes: list[Any], values: li
     """Draw polygons into cells (row 0 at the bottom), one over the other."""
     if not shapes:
         return
-    from rasterio.features import rasterize  # type: ignore[import-untyped]
-    from rasterio.transform import Affine  # type: ignore[import-untyped]
+    from rasterio.features import rasterize
+    from rasterio.transform import Affine
 
     size = frame.resolution
     to_metres = Affine(size, 0.0, frame.x, 0.0, size, frame.y)

@@ -56,7 +56,7 @@ def detect(name: str, data: bytes) -> bool:
 
 def parse(data: bytes, context: ReadContext) -> Cloud:
     """All points. Raises UnreadableFile or TooLarge."""
-    import laspy  # type: ignore[import-untyped]
+    import laspy
 
     count = _check(data, context)
     with _said_as_ours():
@@ -134,7 +134,7 @@ def _check_chunks(data: bytes, start: int, size: int, vlrs: int, count: int, rec
 
 def _check_layers(data: bytes, start: int, table: int, laszip: bytes, kinds: list[tuple[int, int]]) -> None:
     """Of the point formats of 1.4: each chunk tells the sizes of its layers, which are allocated as it says."""
-    import lazrs  # type: ignore[import-untyped]
+    import lazrs
 
     stream = io.BytesIO(data)
     stream.seek(start)

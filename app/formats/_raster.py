@@ -151,8 +151,8 @@ def _reason(error: BaseException) -> str:
 # --- reading ------------------------------------------------------------------------------------------------------
 def read_tiff(data: bytes, limits: Limits) -> Raster:
     """A TIFF's first page, decoded. Raises UnreadableFile or TooLarge, before anything large is allocated."""
-    from rasterio._err import CPLE_BaseError  # type: ignore[import-untyped]
-    from rasterio.io import MemoryFile  # type: ignore[import-untyped]
+    from rasterio._err import CPLE_BaseError
+    from rasterio.io import MemoryFile
 
     if next(itertools.islice(_pages(data), MAX_PAGES, None), None) is not None:
         raise TooLarge(f"the TIFF has more than {MAX_PAGES} pages, or its pages form a loop")
@@ -308,7 +308,7 @@ def write_cog(picture: Picture, crs: str | None, tags: Mapping[str, str]) -> byt
     crs: what it is called, None for none. tags: of the whole file. The pixels are not copied: GDAL reads them where
     they are. No clock and no version goes in, so equal pictures give equal bytes.
     """
-    from rasterio import shutil  # type: ignore[import-untyped]
+    from rasterio import shutil
     from rasterio.io import MemoryFile
 
     pixels = native(picture.pixels)

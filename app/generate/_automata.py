@@ -106,7 +106,7 @@ def _places(occupied: Bool, radius: float) -> tuple[NDArray[np.int32], I64]:
 def _shortest(label: NDArray[np.int32]) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """Lines (row, column to row, column) that join all labelled pieces to one, the shortest first (Kruskal): between
     the nearest cells of pieces whose surroundings touch."""
-    from scipy import ndimage  # type: ignore[import-untyped]
+    from scipy import ndimage
 
     near = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
     owner = label[near[0], near[1]]

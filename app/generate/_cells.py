@@ -185,7 +185,7 @@ def _pieces(occupied: Bool) -> list[Any]:
 
 
 def _outlines(label: NDArray[np.int32]) -> list[Any]:
-    from rasterio import features  # type: ignore[import-untyped]
+    from rasterio import features
 
     found = features.shapes(label, mask=label > 0, connectivity=4)
     return [shapely.normalize(shapely.geometry.shape(s)) for s, _ in found]

@@ -486,7 +486,7 @@ def _across(label: NDArray[np.int32]) -> NDArray[np.int32]:
 def _mend(wave: Wave, piece: Bool, main: Bool, *, close: bool) -> None:
     """Close a piece apart, or open the shortest way from it to the main one (bool [rows, columns] of tiles that hold
     any of it). Where that contradicts, nothing changes."""
-    from scipy import ndimage  # type: ignore[import-untyped]
+    from scipy import ndimage
 
     lattice, model = wave.lattice, wave.model
     rows, columns = np.nonzero(piece)

@@ -620,8 +620,8 @@ def _without_lost(given: Layers, parts: dict[PartKey, Part], notes: Notes) -> di
 
 def _connected(collections: Sequence[Features], nodes: set[str]) -> int:
     """In how many pieces these nodes of a network are."""
-    from scipy.sparse import coo_matrix  # type: ignore[import-untyped]
-    from scipy.sparse.csgraph import connected_components  # type: ignore[import-untyped]
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
 
     number = {i: k for k, i in enumerate(sorted(nodes))}
     said = [p for f in collections for p in f.properties if p.get("kind") == "edge"]
@@ -690,7 +690,7 @@ def _rows(at: Array) -> NDArray[np.int64]:
     Rows run in the direction in which most things have their nearest neighbour; a row ends sideways where there is a
     gap of more than half the usual distance to it.
     """
-    from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+    from scipy.spatial import cKDTree
 
     out = np.full(len(at), -1, np.int64)
     if len(at) < ROW:

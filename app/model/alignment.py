@@ -100,7 +100,7 @@ def of_grids(
     search = _Search(own - middle, theirs, near)
     limit = math.inf if reach is None else reach
     found: list[Fit] = []
-    from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+    from scipy.spatial import cKDTree
 
     tree, judge = cKDTree(theirs), cKDTree(_all(onto))
     every = _some(_all(moving), 20_000)
@@ -262,7 +262,7 @@ def _refined(start: Fit, own: Array, tree: Any, wide: float, near: float) -> Fit
 def _polished(fit: Fit, own: Array, tree: Any, middle: Array, near: float) -> Fit:
     """The least distances both ways, cut off at ``near``: closest points rest a little before them, where round things
     may turn or where cells lie on cells. By Nelder and Mead's simplex, from a few turns around the fit."""
-    from scipy.optimize import minimize  # type: ignore[import-untyped]
+    from scipy.optimize import minimize
     from scipy.spatial import cKDTree
 
     theirs = _some(np.asarray(tree.data), 2 * POINTS)

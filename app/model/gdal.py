@@ -36,7 +36,7 @@ DATA_TYPES = {
 @contextlib.contextmanager
 def gdal(cache: int = CACHE) -> Iterator[Any]:
     """GDAL with a small cache, deaf to files beside the one it is given. Gives rasterio, which is slow to import."""
-    import rasterio  # type: ignore[import-untyped]
+    import rasterio
 
     logging.getLogger("rasterio").setLevel(logging.CRITICAL)  # what it has to say is raised, too
     settings = {

@@ -138,7 +138,7 @@ def _warped(
     colours = picture.colours
     if method is None:
         method = "nearest" if "palette" in colours or picture.pixels.dtype == np.bool_ else "bilinear"
-    from rasterio.vrt import WarpedVRT  # type: ignore[import-untyped]
+    from rasterio.vrt import WarpedVRT
 
     pixels = native(picture.pixels)
     kind, nodata = pixels.dtype, picture.nodata

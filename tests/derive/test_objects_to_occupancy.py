@@ -487,7 +487,7 @@ def test_a_real_building_is_its_walls_and_floors(
 def test_the_walls_of_robast_sim_are_on_its_ros_map(shared: Path) -> None:
     """The building was drawn by hand over the picture of the ROS map, so pixels are cells."""
     import yaml
-    from scipy import ndimage  # type: ignore[import-untyped]
+    from scipy import ndimage
 
     folder = shared / "data/openrmf_building/robast_sim"
     derived = grid(read(folder / "tiplu.building.yaml"), level="Tiplu")

@@ -11,7 +11,7 @@ import pytest
 import shapely
 from lxml import etree
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+from scipy.spatial import cKDTree
 
 from app import bundle, derive, formats, parameters
 from app.bundle import Hints, Known

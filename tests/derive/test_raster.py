@@ -129,8 +129,8 @@ def test_an_open_surface_encloses_nothing() -> None:
 
 
 def test_areas_with_holes_agree_with_rasterio() -> None:
-    from rasterio.features import rasterize  # type: ignore[import-untyped]
-    from rasterio.transform import Affine  # type: ignore[import-untyped]
+    from rasterio.features import rasterize
+    from rasterio.transform import Affine
 
     random = np.random.default_rng(3)
     for _ in range(10):

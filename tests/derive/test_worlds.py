@@ -75,7 +75,7 @@ def middles(grid: OccupancyGrid) -> Any:
 
 @pytest.mark.parametrize("pair", PAIRS)
 def test_a_slice_covers_the_map_that_a_robot_made_there(shared: Path, pair: str) -> None:
-    from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+    from scipy.spatial import cKDTree
 
     data = shared / "data"
     folder, _, maps, shift, least = PAIRS[pair]

@@ -97,7 +97,7 @@ def test_rotation_is_about_fixed_axes() -> None:
 @given(st.tuples(*[st.floats(-4, 4)] * 3))
 @settings(max_examples=50, deadline=None)
 def test_rotation_agrees_with_scipy(angles: tuple[float, float, float]) -> None:
-    from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
+    from scipy.spatial.transform import Rotation
 
     assert rotation(*angles) == pytest.approx(Rotation.from_euler("xyz", angles).as_matrix())
 
