@@ -119,6 +119,7 @@ class Access:
         self._known: OrderedDict[bytes, tuple[Principal, float]] = OrderedDict()
         self._sources: OrderedDict[str, deque[float]] = OrderedDict()
         self._lock = threading.Lock()
+        self._forgotten = 0
 
     def known(self, header: bytes | None) -> Principal | None:
         """Who sent this Authorization header, if it was checked less than a second ago. Never blocks."""
@@ -142,13 +143,15 @@ class Access:
             raise Throttled("too many wrong tokens came from your address: wait a minute and use a valid one")
         if header is None:
             raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
+        forgotten = self._forgotten
         token = self._find(_token(header)) if _token(header) else None
         if token is None or (token.expires is not None and token.expires <= datetime.now(UTC)):
             self._note_failure(source)
             raise Unauthenticated("the token is unknown or has expired: ask an administrator for a new one")
         principal = Principal.of(token)
         with self._lock:
-            self._known[hashlib.sha256(header).digest()] = (principal, self._clock() + FRESH_SECONDS)
+            if forgotten == self._forgotten:  # else it may have been revoked while it was looked up
+                self._known[hashlib.sha256(header).digest()] = (principal, self._clock() + FRESH_SECONDS)
             while len(self._known) > MAX_KNOWN:
                 self._known.popitem(last=False)
         return principal
@@ -156,6 +159,7 @@ class Access:
     def forget(self) -> None:
         """Ask the store again for every token: one was revoked."""
         with self._lock:
+            self._forgotten += 1
             self._known.clear()
 
     def _failed(self, source: str) -> int:

@@ -91,7 +91,7 @@ class Hot:
         self._limit, self._size = here_bytes, 0
         self.access, self._metrics, self.generation = access, metrics, generation
         self._entries: OrderedDict[Key, Resource] = OrderedDict()
-        self._looks: Together[tuple[Key, int, Any], Any] = Together()
+        self._looks: Together[tuple[Any, ...], Any] = Together()
         self._lock = threading.Lock()
         self._tallies: dict[str, list[int]] = {}
 
@@ -123,16 +123,18 @@ class Hot:
             if _matches(request, empty.etag):
                 self._put(key, empty)
                 return empty
-            full = await self.shared(request, self._ready, here, key, empty)
-            if full is not None:
-                return full
+            # From here on the recipe says what is meant: who was told of a later commit has another one.
+            made: Resource | None = await self._looks.run((key, _meant(recipe), "ready"), self._ready, here, key, empty)
+            if made is not None:
+                return made
             try:
                 outcome = await here.work.make(recipe, who, address_of(request))
             except CannotDerive:
                 continue  # it is remembered: the next recipe goes another way, or says that there is none
             if isinstance(outcome, Started):
                 return outcome
-            return await self.shared(request, self._fill, key, empty, outcome)
+            full: Resource = await self._looks.run((key, _meant(recipe), "fill"), self._fill, key, empty, outcome)
+            return full
 
     def _ready(self, here: Services, key: Key, empty: Resource) -> Resource | None:
         assert empty.recipe is not None
@@ -150,10 +152,10 @@ class Hot:
     async def shared(self, request: Request, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         """What ``function`` finds, called in a thread: one look for all who ask for this address at the same moment.
 
-        Nobody joins a look that began before the last commit. What it finds must not depend on who asks.
+        Nobody joins a look that began before the last commit. So what it finds must depend on what commits tell of
+        alone (robots' reports are not), and on nothing that was found before it, nor on who asks.
         """
-        key = (_key(request), self.generation(), function)
-        found: T = await self._looks.run(key, function, *args, **kwargs)
+        found: T = await self._looks.run((_key(request), self.generation(), function), function, *args, **kwargs)
         return found
 
     def _resource(
@@ -234,8 +236,13 @@ def _file_etag(recipe: Recipe, name: str) -> str:
     return f'{recipe.etag[:-1]}-{hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]}"'
 
 
+def _meant(recipe: Recipe) -> tuple[str, int, str]:
+    """What tells recipes at one address apart."""
+    return recipe.key, recipe.version.number, recipe.version.environment
+
+
 def _same(a: Recipe, b: Recipe) -> bool:
-    return a.key == b.key and a.version.number == b.version.number and a.version.environment == b.version.environment
+    return _meant(a) == _meant(b)
 
 
 def _matches(request: Request, etag: str) -> bool:

@@ -1,0 +1,335 @@
+"""Who asks at the same moment shares one look, and nobody gets an answer older than what he was told of."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from app.api import channels, maps
+from app.api.access import Access
+from app.api.together import Together
+from app.errors import NotFound, Unavailable
+from app.store import Store
+from app.store.database import Database
+from tests.api import samples
+from tests.api.conftest import Api
+
+
+def network(name: str) -> dict[str, bytes]:
+    return {"n.tmap2.yaml": samples.tmap2({name: (0.5, 1.0), "there": (2.5, 1.0)}, ((name, "there"),))}
+
+
+class Gate:
+    """Holds calls until it is opened; counts them."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+        self.reached, self.open = threading.Event(), threading.Event()
+
+    def __call__(self) -> None:
+        self.calls += 1
+        self.reached.set()
+        assert self.open.wait(20)
+
+
+@contextmanager
+def at_once(count: int) -> Iterator[Callable[..., Any]]:
+    """Starts calls in threads; opens nothing and waits for nothing until the block ends."""
+    with ThreadPoolExecutor(count) as pool:
+        yield pool.submit
+
+
+# --- the tool itself ---
+
+
+def test_one_call_for_all() -> None:
+    async def run() -> None:
+        together: Together[str, int] = Together()
+        gate = Gate()
+
+        def look(number: int) -> int:
+            gate()
+            return number
+
+        asked = [asyncio.create_task(together.run("a", look, k)) for k in range(5)]
+        other = asyncio.create_task(together.run("b", look, 7))
+        await asyncio.sleep(0.05)
+        gate.open.set()
+        assert await asyncio.gather(*asked) == [0] * 5
+        assert await other == 7
+        assert gate.calls == 2
+        assert await together.run("a", look, 9) == 9, "what is over is not shared"
+
+    asyncio.run(run())
+
+
+def test_who_goes_away_harms_nobody() -> None:
+    async def run() -> None:
+        together: Together[str, int] = Together()
+        gate = Gate()
+
+        def look() -> int:
+            gate()
+            return 1
+
+        first, second = (asyncio.create_task(together.run("a", look)) for _ in range(2))
+        await asyncio.sleep(0.05)
+        first.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await first
+        third = asyncio.create_task(together.run("a", look))
+        await asyncio.sleep(0.05)
+        gate.open.set()
+        assert (await second, await third, gate.calls) == (1, 1, 1)
+
+    asyncio.run(run())
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_error_is_everybodys_and_is_not_kept(caplog: pytest.LogCaptureFixture) -> None:
+    async def run() -> None:
+        together: Together[str, int] = Together()
+        gate = Gate()
+
+        def fail() -> int:
+            gate()
+            raise NotFound("it is not here")
+
+        asked = [asyncio.create_task(together.run("a", fail)) for _ in range(3)]
+        alone = asyncio.create_task(together.run("b", fail))
+        await asyncio.sleep(0.05)
+        alone.cancel()  # nobody is left to hear of its error
+        gate.open.set()
+        told = await asyncio.gather(*asked, return_exceptions=True)
+        assert [type(error) for error in told] == [NotFound] * 3
+        assert await together.run("a", lambda: 5) == 5
+        await asyncio.sleep(0.05)
+
+    asyncio.run(run())
+    assert not caplog.records
+
+
+# --- maps, manifests, channels ---
+
+
+def test_no_map_is_older_than_a_commit_that_was_told(api: Api, bare: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slow look that found the version of before does not answer who was told of the next one."""
+    api.upload(bare, network("old"))
+    path = f"/maps/{bare}/tmap2/network.tmap2.yaml"
+    api.get(path)
+    api.upload(bare, network("mid"))  # the answer in memory is not this one's; its map is made
+    api.get(f"environments/{bare}/versions/2/maps/tmap2/network.tmap2.yaml")
+    here = api.app.state.services
+    gate, began = Gate(), threading.Event()
+    find, ready = maps._resolve, here.maps.ready
+
+    def resolve(*args: Any) -> Any:
+        found = find(*args)
+        if not began.is_set():
+            began.set()
+            api.upload(bare, network("new"))  # a commit between this look and the next
+            time.sleep(0.3)
+        return found
+
+    def slow(recipe: Any) -> Any:
+        if recipe.version.number == 2:
+            gate()
+        return ready(recipe)
+
+    monkeypatch.setattr(maps, "_resolve", resolve)
+    monkeypatch.setattr(here.maps, "ready", slow)
+    with at_once(2) as ask:
+        first = ask(api.get, path)
+        assert gate.reached.wait(20)
+        second = ask(api.as_(api.token).get, path)
+        time.sleep(0.2)
+        gate.open.set()
+        assert b"new" in second.result(20).content
+        assert second.result().headers["fleetmap-version"] == "3"
+        assert b"mid" in first.result(20).content
+    assert b"new" in api.get(path).content
+
+
+def test_what_robots_say_is_in_the_next_answer(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports of robots change no generation number: who was told that his is stored sees it all the same."""
+    root = api.get(f"environments/{farm}/versions/3").json()["root"]
+    gate, quick = Gate(), channels._listed
+    first_only = iter([True])
+
+    def slow(*args: Any) -> Any:
+        found = quick(*args)
+        if next(first_only, False):
+            gate()
+        return found
+
+    monkeypatch.setattr(channels, "_listed", slow)
+    with at_once(2) as ask:
+        first = ask(api.get, f"environments/{farm}/channels")
+        assert gate.reached.wait(20)
+        status = {"environment": farm, "channel": "latest", "version": 3, "root": root, "state": "active"}
+        other = api.as_(api.token)
+        other("PUT", "robots/mower/status", 200, json=status)
+        second = ask(other.get, f"environments/{farm}/channels")
+        time.sleep(0.2)
+        gate.open.set()
+        assert second.result(20).json()[0]["robots"]["holding"] == 1
+        assert first.result(20).json()[0]["robots"]["total"] == 0
+
+
+def test_one_look_for_a_fleet_but_none_for_strangers(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    gate, quick = Gate(), Store.standing
+
+    def slow(self: Store, *args: Any) -> Any:
+        gate()
+        return quick(self, *args)
+
+    path = f"environments/{farm}/versions/latest/manifest?formats=tmap2"
+    api.get(path)
+    api.upload(farm, network("next"))
+    robots = [api.token_for("robot", robot=f"r{k}", environments=farm) for k in range(6)]
+    stranger = api.token_for("viewer", environments="other-*")
+    monkeypatch.setattr(Store, "standing", slow)
+    with at_once(8) as ask:
+        asked = [ask(robot.get, path) for robot in robots]
+        assert gate.reached.wait(20)
+        assert ask(stranger.get, path, None).result(20).status_code == 403
+        assert ask(api.as_("none").get, path, None).result(20).status_code == 401
+        time.sleep(0.2)
+        gate.open.set()
+        answers = [one.result(20) for one in asked]
+    assert {a.json()["version"] for a in answers} == {4}
+    assert len({a.content for a in answers}) == 1
+    assert gate.calls < 4, "at most one before and one after it was made"
+
+
+def test_an_environment_that_is_not_there_is_told_to_each(
+    api: Api, fresh: Callable[[], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate, quick = Gate(), channels._listed
+
+    def slow(*args: Any) -> Any:
+        gate()
+        return quick(*args)
+
+    monkeypatch.setattr(channels, "_listed", slow)
+    path = f"environments/{fresh()}/channels?robots=false"
+    clients = [api.as_(api.token) for _ in range(3)]
+    with at_once(3) as ask:
+        asked = [ask(client.problem, "GET", path, 404) for client in clients]
+        assert gate.reached.wait(20)
+        time.sleep(0.2)
+        gate.open.set()
+        assert [one.result(20)["status"] for one in asked] == [404] * 3
+
+
+# --- tokens ---
+
+
+def test_a_token_is_looked_up_once_and_each_its_own(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    gate, quick = Gate(), Store.find_token
+    asked_for: list[str] = []
+
+    def slow(self: Store, text: str) -> Any:
+        asked_for.append(text)
+        gate()
+        return quick(self, text)
+
+    tokens = [api.token_for("viewer").token, api.token_for("viewer", environments="other-*").token, "x" * 40]
+    access = api.app.state.services.access
+    access.forget()
+    monkeypatch.setattr(access, "_find", lambda text: slow(api.app.state.services.store, text))
+    clients = [api.as_(token) for token in tokens for _ in range(3)]
+    with at_once(len(clients)) as ask:
+        asked = [ask(client.get, f"environments/{farm}", None) for client in clients]
+        time.sleep(0.4)
+        gate.open.set()
+        statuses = [one.result(20).status_code for one in asked]
+    assert statuses == [200] * 3 + [403] * 3 + [401] * 3
+    assert sorted(asked_for) == sorted(tokens), "one look for each token"
+
+
+def test_a_token_revoked_while_it_is_looked_up_is_not_believed_again() -> None:
+    gate = Gate()
+    store = {"t"}
+
+    class Found:
+        id, name, role, environments, robot, expires = "1", "n", "viewer", None, None, None
+
+    def find(text: str) -> Any:
+        found = Found() if text in store else None
+        gate()
+        return found
+
+    access = Access(find, failures=10)
+    with at_once(1) as ask:
+        looking = ask(access.check, b"Bearer t", "1.2.3.4")
+        assert gate.reached.wait(20)
+        store.clear()
+        access.forget()
+        gate.open.set()
+        looking.result(20)  # it was valid when it was asked for
+    assert access.known(b"Bearer t") is None
+
+
+# --- writers ---
+
+
+def test_writers_take_turns(tmp_path: Any) -> None:
+    """One that takes long lets others wait, not fail; one that fails gives its turn back; readers never wait."""
+    told: list[int] = []
+    database = Database(f"sqlite:///{tmp_path}/turns.sqlite3", readonly=False, written=lambda: told.append(1))
+    with database.write() as connection:
+        connection.exec_driver_sql("CREATE TABLE t (n INTEGER)")
+    gate = Gate()
+
+    def write(n: int, before: Callable[[], None] = lambda: None) -> None:
+        with database.write() as connection:
+            connection.exec_driver_sql(f"INSERT INTO t VALUES ({n})")
+            before()
+
+    def read() -> int:
+        with database.read() as connection:
+            return int(connection.exec_driver_sql("SELECT count(*) FROM t").scalar_one())
+
+    def broken() -> None:
+        raise RuntimeError("on the way")
+
+    with at_once(12) as ask:
+        long = ask(write, 0, gate)
+        assert gate.reached.wait(20)
+        others = [ask(write, k) for k in range(1, 9)]
+        bad = ask(write, 99, broken)
+        assert ask(read).result(5) == 0
+        time.sleep(0.1)
+        assert not any(one.done() for one in (*others, bad))
+        gate.open.set()
+        for one in (long, *others):
+            one.result(20)
+        with pytest.raises(RuntimeError):
+            bad.result(20)
+    assert read() == 9
+    assert len(told) == 10, "what failed is not told"
+    database.close()
+
+
+def test_a_turn_that_never_comes_is_told(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.store.database.TURN_SECONDS", 0.05)
+    database = Database(f"sqlite:///{tmp_path}/turns.sqlite3", readonly=False)
+    with database.write(), at_once(1) as ask:
+
+        def second() -> None:
+            with database.write():
+                raise AssertionError("two write at once")
+
+        with pytest.raises(Unavailable, match="try again"):
+            ask(second).result(20)
+    with database.write():
+        pass
+    database.close()
