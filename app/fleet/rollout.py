@@ -2,26 +2,28 @@
 many fail.
 
 Shares are of the channel's robots that are online. Robots that say that they failed count as well where they are not
-online any more: what broke them may have been the map.
+online any more: what broke them may have been the map. What was said before a stage began does not count in it; that is
+known from what was stored then, so that a clock that is set back hides no failure.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import datetime, timedelta
+from fractions import Fraction
 
 from app.fleet.picture import is_online, is_ready
-from app.store.values import Robot, Rollout, Step
+from app.store.values import Robot, Rollout, Step, rfc3339
 
 
 def decide(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> Step | None:
     """The next step of a roll-out, None for waiting on. robots: of its channel."""
     begun = rollout.started if rollout.moved is None else rollout.moved
-    failed = [r for r in robots if r.report.state == "failed" and r.report.root == rollout.root and r.time >= begun]
-    names = {r.robot for r in failed}
+    failed = [r for r in robots if r.failed_with(rollout.root)]
+    names = {r.robot for r in failed if rollout.said_before.get(r.robot) != rfc3339(r.time)}
     counted = len(names | {r.robot for r in robots if is_online(r, now)})
     broken = f"{len(names)} of {counted} robots failed"
-    too_many = rollout.failed is not None and bool(names) and len(names) >= rollout.failed * counted
+    too_many = rollout.failed is not None and bool(names) and _reaches(len(names), rollout.failed, counted)
     if rollout.state == "watching":
         if too_many:
             return Step("move_back", "rolled_back", broken)
@@ -32,10 +34,15 @@ def decide(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> Step | N
         return Step("end", "failed", f"{broken} to fetch it: the channel stays")
     ready = [r for r in robots if is_online(r, now) and is_ready(r, rollout.root)]
     online = sum(is_online(r, now) for r in robots)
-    enough = rollout.ready is None or (online > 0 and len(ready) >= rollout.ready * online)
+    enough = rollout.ready is None or (online > 0 and _reaches(len(ready), rollout.ready, online))
     if enough and (rollout.activate_at is None or now >= rollout.activate_at):
         told = "its time has come" if rollout.ready is None else f"{len(ready)} of {online} robots are ready"
         return Step("move", "waiting", told)
     if rollout.deadline is not None and now >= rollout.deadline:
         return Step("end", "expired", f"only {len(ready)} of {online} robots are ready: the channel stays")
     return None
+
+
+def _reaches(count: int, share: float, total: int) -> bool:
+    """Whether so many are this share of all, the share being the decimal that was asked for: 0.28 of 25 is 7."""
+    return count >= Fraction(repr(share)) * total

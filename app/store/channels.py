@@ -187,12 +187,18 @@ Decide = Callable[[Rollout, Sequence[Robot], datetime], Step | None]
 
 
 def _next(connection: Connection, channel: Row[Any], now: datetime, decide: Decide) -> Step | None:
-    return decide(Rollout.from_dict(channel.rollout), robots_of(connection, channel.environment_id, channel.name), now)
+    return decide(Rollout.from_row(channel.rollout), robots_of(connection, channel.environment_id, channel.name), now)
+
+
+def _marked(connection: Connection, environment: Row[Any], channel: str, rollout: Rollout) -> Rollout:
+    """The roll-out at the beginning of a stage: which robots said before it that they failed with this version."""
+    said = (r for r in robots_of(connection, environment.id, channel) if r.failed_with(rollout.root))
+    return replace(rollout, said_before={r.robot: rfc3339(r.time) for r in said})
 
 
 def _take(connection: Connection, environment: Row[Any], channel: Row[Any], step: Step, now: datetime) -> None:
     """One step of a roll-out: the move or the way back with its event, or the end."""
-    rollout = Rollout.from_dict(channel.rollout)
+    rollout = Rollout.from_row(channel.rollout)
     ended = replace(rollout, state=step.state, detail=step.detail)
     if step.do == "move":
         author = channel.planned_author or ""
@@ -215,8 +221,8 @@ def _take(connection: Connection, environment: Row[Any], channel: Row[Any], step
 
 def _end(connection: Connection, environment: Row[Any], channel: Row[Any], state: RolloutState, detail: str) -> None:
     """A roll-out is over; a move that still waits for it is dropped."""
-    rollout = replace(Rollout.from_dict(channel.rollout), state=state, detail=detail)
-    values: dict[str, Any] = {"rollout": rollout.as_dict(), "rollout_state": state}
+    rollout = replace(Rollout.from_row(channel.rollout), state=state, detail=detail)
+    values: dict[str, Any] = {"rollout": rollout.as_row(), "rollout_state": state}
     if channel.rollout_state == "waiting":
         values |= {"planned_version": None, "planned_at": None, "planned_author": None}
     _store(connection, environment, channel.name, channel, **values)
@@ -253,7 +259,7 @@ def _as_channel(row: Row[Any], root: str | None, planned_root: str | None) -> Ch
     planned = None
     if row.planned_version is not None:
         planned = Planned(row.planned_version, row.planned_at, row.planned_author or "", planned_root or "")
-    rollout = None if row.rollout is None else Rollout.from_dict(row.rollout)
+    rollout = None if row.rollout is None else Rollout.from_row(row.rollout)
     return Channel(row.name, row.version, root, row.sequence, planned, row.author, row.time, rollout)
 
 
@@ -290,9 +296,10 @@ def _move(
         watched = rollout.failed is not None and before is not None and before.number != number
         state: RolloutState = "watching" if watched else "done"
         rollout = replace(rollout, state=state, moved=now, before=before.number if before else None)
+        rollout = _marked(connection, environment, channel, rollout)
     nothing |= {"rollout": None, "rollout_state": None}
     if rollout is not None:
-        nothing |= {"rollout": rollout.as_dict(), "rollout_state": rollout.state}
+        nothing |= {"rollout": rollout.as_row(), "rollout_state": rollout.state}
     if before is not None and before.number == number:
         _store(connection, environment, channel, known, **nothing)
         return
@@ -330,9 +337,11 @@ def _plan(
     before = None
     if known is not None and known.version is not None:
         before = read_version(connection, environment, known.version)
+    if rollout is not None:
+        rollout = _marked(connection, environment, channel, rollout)
     sequence = environment.sequence + 1
     plan: dict[str, Any] = {"planned_version": number, "planned_at": at, "planned_author": author}
-    plan |= {"rollout": rollout and rollout.as_dict(), "rollout_state": rollout and rollout.state}
+    plan |= {"rollout": rollout and rollout.as_row(), "rollout_state": rollout and rollout.state}
     if known is None:
         plan |= {"version": None, "sequence": 0, "author": author, "time": now}
     _store(connection, environment, channel, known, **plan)

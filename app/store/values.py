@@ -270,7 +270,8 @@ class Rollout:
     ready: the channel moves when this share of its online robots has the version (None: at its time alone). failed: it
     moves back, or does not move at all, when this share says that it failed. deadline: the move is given up then.
     window: seconds of watching. before: the version that it moves back to. state: ``waiting`` until it moves,
-    ``watching`` after it, then how it ended.
+    ``watching`` after it, then how it ended. said_before: robots that said already that they failed with this version
+    when its present stage began, and when that was heard: what came after it is told by this, not by comparing clocks.
     """
 
     version: int
@@ -285,18 +286,23 @@ class Rollout:
     before: int | None = None
     moved: datetime | None = None
     detail: str = ""
+    said_before: Mapping[str, str] = field(default_factory=dict)
 
-    def as_dict(self) -> dict[str, Any]:
-        """JSON-like, with all members."""
+    def as_row(self) -> dict[str, Any]:
+        """JSON-like, with all members, as it is stored."""
         out: dict[str, Any] = {}
         for item in fields(self):
             value = getattr(self, item.name)
             out[item.name] = rfc3339(value) if isinstance(value, datetime) else value
         return out
 
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-like, what clients see of it."""
+        return {name: value for name, value in self.as_row().items() if name != "said_before"}
+
     @classmethod
-    def from_dict(cls, members: Mapping[str, Any]) -> Rollout:
-        """The reverse of ``as_dict``."""
+    def from_row(cls, members: Mapping[str, Any]) -> Rollout:
+        """The reverse of ``as_row``; rows of earlier releases have no ``said_before``."""
         values = dict(members)
         for name in ("started", "activate_at", "deadline", "moved"):
             values[name] = None if values[name] is None else datetime.fromisoformat(values[name])
@@ -438,6 +444,10 @@ class Robot:
     held: Held | None
     there: bool | None = None
     seen: datetime | None = None
+
+    def failed_with(self, root: str) -> bool:
+        """Whether it says that it failed with a version."""
+        return self.report.state == "failed" and self.report.root == root
 
 
 @dataclass(frozen=True, slots=True)

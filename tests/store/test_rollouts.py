@@ -10,7 +10,7 @@ import pytest
 from app.fleet import decide
 from app.store import Store
 from app.store.changes import Replace
-from app.store.values import Channel, Heard, Report, Rollout
+from app.store.values import Channel, Heard, Report, Robot, Rollout
 from tests.store.samples import GRID, grid, save
 
 
@@ -78,6 +78,40 @@ def test_it_moves_when_enough_are_ready(fleet: Fleet):
     assert fleet.tick(6) == (2, "done")
     assert len(fleet.told()) == count
     assert fleet.channel().planned is None
+
+
+@pytest.mark.parametrize(("count", "share", "enough"), [(25, 0.28, 7), (25, 0.56, 14), (1, 1.0, 1), (3, 0.001, 1)])
+def test_exactly_the_share_is_enough(count: int, share: float, enough: int):
+    """In binary, 0.28 of 25 is a little more than 7."""
+    now = datetime.now(UTC)
+
+    def step(state: Any, version: str, those: int) -> Any:
+        rollout = Rollout(2, "b", now, ready=share, failed=share, state=state, moved=now, before=1)
+        said = [(version, "b") if k < those else ("active", "a") for k in range(count)]
+        robots = [
+            Robot(f"r{k}", "farm", Report("production", 1, r, s), now, now, None) for k, (s, r) in enumerate(said)
+        ]
+        return decide(rollout, robots, now)
+
+    for stage, state, then in (("waiting", "ready", "move"), ("watching", "failed", "move_back")):
+        assert step(stage, state, enough).do == then
+        assert step(stage, state, enough - 1) is None
+
+
+@pytest.mark.parametrize("shift", [-60, 60])
+def test_a_clock_that_is_set_hides_no_failure(fleet: Fleet, shift: float):
+    fleet.say("abc", 1, "active")
+    fleet.say("a", 2, "failed")  # an attempt of before: it does not count
+    fleet.roll(failed=0.5, window=600.0)
+    assert fleet.tick(1) == (2, "watching")
+    fleet.say("b", 2, "failed", 2 + shift)
+    assert fleet.tick(3 + shift) == (2, "watching")
+    fleet.say("c", 2, "failed", 4 + shift)
+    assert fleet.tick(5 + shift) == (1, "rolled_back")
+    ended = fleet.channel().rollout
+    assert ended is not None
+    assert ended.detail == "2 of 3 robots failed"
+    assert "said_before" not in ended.as_dict()
 
 
 def test_robots_that_are_away_are_not_waited_for(fleet: Fleet):
