@@ -189,7 +189,7 @@ class Bus:
                 self._session = zenoh.open(zenoh.Config.from_json5(session_configuration(self.options)))
                 self._declare(self._session)
             except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
-                self._problem = f"no router at {self._where}: {str(error).splitlines()[0][:300]}"
+                self._problem = f"no router at {self.where}: {str(error).splitlines()[0][:300]}"
                 self._close_session()
                 return False
             self.opened += 1
@@ -227,7 +227,8 @@ class Bus:
                 self._router = None
 
     @property
-    def _where(self) -> str:
+    def where(self) -> str:
+        """The router's address, or addresses."""
         return self.options.connect if self.options.mode == "client" else self.options.listen
 
     def _declare_publisher(self, session: zenoh.Session, environment: str) -> ext.AdvancedPublisher:

@@ -12,25 +12,22 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import logging
-import os
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import zenoh
 from zenoh import ext
 
 from app.errors import FleetMapError
-from app.events import cdr, ros_names
+from app.events import cdr, ros_names, single
 from app.events.bus import BusOptions, session_configuration
-from app.events.relay import take_lock
 from app.events.ros_names import Chosen, Keys, Topic
+from app.events.single import POLL_SECONDS, Single
 from app.store.values import Version
 
 log = logging.getLogger(__name__)
@@ -40,15 +37,13 @@ FRAME = "map"
 
 HEARTBEAT_SECONDS = 0.5
 LOOK_SECONDS = 0.02
-POLL_SECONDS = 1.0
 ASK_SECONDS = 5.0
 """How often the database is asked all the same: another host may have committed."""
 
 RETRY_SECONDS = 30.0
 """After a map could not be made it is tried again so much later, or when the channel moves."""
 
-LOCK_FILE = "ros2.lock"
-STATE_FILE = "ros2.json"
+NAME = "ros2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +140,7 @@ class _Place:
     retry: float | None = None
 
 
-class Ros2:
+class Ros2(Single):
     """The thread. One process of a data folder publishes (it holds a file lock); where it dies, another takes over."""
 
     def __init__(
@@ -158,48 +153,14 @@ class Ros2:
         look: Look,
         fetch: Fetch,
     ) -> None:
-        self._options, self._bus, self._data_dir = options, bus, data_dir
+        super().__init__(data_dir, NAME, well="maps go out to ROS 2", trouble="NOTHING GOES OUT TO ROS 2")
+        self._options, self._bus = options, bus
         self._generation, self._look, self._fetch = generation, look, fetch
         self._session: zenoh.Session | None = None
         self._node: Any = None
         self._entities = 0
         self._places: dict[str, _Place] = {}
         self._owners: dict[str, str] = {}
-        self._lock: IO[str] | None = None
-        self._told: dict[str, Any] = {}
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="fleetmap-ros2", daemon=True)
-
-    def start(self) -> None:
-        """Begin; returns at once."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """Take all topics back."""
-        self._ending.set()
-        self._thread.join(15)
-        self._shut()
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
-
-    def _run(self) -> None:
-        while not self._ending.is_set():
-            try:
-                if self._lock is None:
-                    self._lock = take_lock(self._data_dir / LOCK_FILE)
-                    if self._lock is None:
-                        self._ending.wait(POLL_SECONDS)
-                        continue
-                    self._note({"state": "starting"})  # what a process said that was killed no longer holds
-                self._round()
-            except FleetMapError as error:
-                self._note({"state": "down", "detail": error.detail})
-                self._ending.wait(POLL_SECONDS)
-            except Exception:
-                log.exception("publishing to ROS 2 stumbled")
-                self._shut()  # what was said last is not known for sure
-                self._ending.wait(POLL_SECONDS)
 
     def _round(self) -> None:
         """Publish what has changed, then wait for more."""
@@ -228,6 +189,10 @@ class Ros2:
             return False
         return True
 
+    def _stumbled(self) -> None:
+        super()._stumbled()
+        self._shut()  # what was said last is not known for sure
+
     def _shut(self) -> None:
         for name in list(self._places):
             self._retire(name, ())
@@ -254,8 +219,11 @@ class Ros2:
             place.root, place.retry = version.root, None
             try:
                 content = self._fetch(version)
-            except FleetMapError as error:
-                log.warning("ROS 2: %s stays as it is: %s", name, error.detail)
+            except Exception as error:  # one environment's trouble is not the others'
+                if isinstance(error, FleetMapError):
+                    log.warning("ROS 2: %s stays as it is: %s", name, error.detail)
+                else:
+                    log.exception("ROS 2: %s stays as it is", name)
                 place.retry = time.monotonic() + RETRY_SECONDS
                 continue
             for reason in content.absent:
@@ -323,18 +291,6 @@ class Ros2:
             place.topics.pop(topic).close()
             del self._owners[topic]
 
-    def _note(self, state: dict[str, Any]) -> None:
-        """Tell the log when it changes, and all workers by a file."""
-        if state == self._told:
-            return
-        if state["state"] == "down" != self._told.get("state"):
-            log.error("NOTHING GOES OUT TO ROS 2: %s", state.get("detail", ""))
-        self._told = state
-        path = self._data_dir / STATE_FILE
-        temporary = path.with_suffix(f".{os.getpid()}")
-        temporary.write_text(json.dumps(state))
-        temporary.replace(path)
-
 
 def update(before: cdr.Grid, after: cdr.Grid, version: Version) -> bytes:
     """The smallest rectangle that holds all cells in which two different grids of one frame differ, as a message."""
@@ -349,11 +305,7 @@ def update(before: cdr.Grid, after: cdr.Grid, version: Version) -> bytes:
 
 def state_of(data_dir: Path) -> dict[str, Any]:
     """What /readyz says of topics: ``starting``, ``connected`` with their number, or ``down`` with the reason."""
-    try:
-        found: dict[str, Any] = json.loads((data_dir / STATE_FILE).read_text())
-    except (OSError, ValueError):
-        return {"state": "starting"}
-    return found
+    return single.state_of(data_dir, NAME)
 
 
 def _close(session: Any) -> None:
