@@ -64,7 +64,7 @@ class UnreadableFile(BadUpload):
 
 
 class TooLarge(BadUpload):
-    """An upload, or what it would unfold to, beyond a limit (limits are settings)."""
+    """An upload, what it would unfold to, or an answer over Zenoh, beyond a limit (limits are settings)."""
 
 
 class UnsafeArchive(BadUpload):

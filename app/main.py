@@ -319,7 +319,13 @@ def relay_of(settings: Settings, here: Services) -> Relay | None:
     if settings.zenoh_users is not None and "tcp/" in settings.zenoh_listen:
         log.warning("users of the router come in without TLS: what is said can be read and changed on the way")
     options = _bus_options(settings)
-    made = Bus(options, ask=partial(events.ask, here), on_status=here.fleet.heard, on_alive=here.fleet.alive)
+    made = Bus(
+        options,
+        ask=partial(events.ask, here, options.max_reply_bytes),
+        explain=problems.body_of,
+        on_status=here.fleet.heard,
+        on_alive=here.fleet.alive,
+    )
     relay = Relay(here.store, made, settings.data_dir)
     relay.start()
     return relay

@@ -19,8 +19,9 @@ from app.api.answers import Route
 from app.api.maps import number_of
 from app.api.schemas import told
 from app.api.services import Here, Services
-from app.errors import Invalid, NotFound, Problem, Unavailable
-from app.events.bus import Answer
+from app.convert.cache import Made
+from app.errors import Invalid, NotFound, Problem, TooLarge, Unavailable
+from app.events.bus import Answer, Make
 from app.store.values import Event
 
 LOOK_SECONDS = 0.02
@@ -158,10 +159,11 @@ def _line(event: Event, number: int) -> bytes:
     return b"id: %d\nevent: %s\ndata: %s\n\n" % (number, str(event.body["type"]).encode(), orjson.dumps(event.body))
 
 
-def ask(here: Services, environment: str, rest: str, parameters: Mapping[str, str]) -> Answer:
-    """What HTTP answers at ``/environments/{environment}/versions/{rest}``: ``{v}/version``, ``{v}/maps/{format}/…``.
+def ask(here: Services, most: int, environment: str, rest: str, parameters: Mapping[str, str]) -> Answer | Make:
+    """What HTTP answers at ``/environments/{environment}/versions/{rest}``: ``{v}/version``, ``{v}/maps/{format}/…``;
+    for a map that is not there, what makes it.
 
-    Blocks. Raises what the calls over HTTP answer as problems.
+    most: so many bytes are answered. Blocks. Raises what the calls over HTTP answer as problems.
     """
     pieces = rest.split("/")
     version = here.store.version(environment, number_of(pieces[0]))
@@ -174,12 +176,20 @@ def ask(here: Services, environment: str, rest: str, parameters: Mapping[str, st
     derive = values.pop("derive", "true")
     if derive not in ("true", "false"):
         raise Invalid("derive must be true or false", [Problem("true or false", where="derive")])
-    file = "/".join(pieces[3:]) or None
-    made = here.maps.at_once(version, pieces[2], values, derive=derive == "true", file=file)
-    found = made.whole() if file is None else made.file(file)
+    name, file = pieces[2], "/".join(pieces[3:]) or None
+    made = here.maps.ready(here.maps.recipe(version, name, values, derive=derive == "true", file=file))
+    if made is not None:
+        return _file_of(made, file, most)
+    return lambda: _file_of(here.maps.at_once(version, name, values, derive=derive == "true", file=file), file, most)
+
+
+def _file_of(made: Made, name: str | None, most: int) -> Answer:
+    found = made.whole() if name is None else made.file(name)
     if found is None:
         names = ", ".join(f.name for f in made.files[:20])
-        raise NotFound(f"this map has no file {file!r}; its files are: {names}")
+        raise NotFound(f"this map has no file {name!r}; its files are: {names}")
+    if found.size > most:
+        raise TooLarge(f"the map has {found.size} bytes, more than is sent over Zenoh ({most}): fetch it over HTTP")
     return Answer(found.path.read_bytes(), found.media_type)
 
 

@@ -159,6 +159,11 @@ def of_error(error: errors.FleetMapError) -> Response:
     return problem(status, error.detail, title=title, type_=type_, problems=error.problems, headers=headers)
 
 
+def body_of(error: Exception) -> bytes:
+    """The JSON of any error, for who asks otherwise than over HTTP."""
+    return bytes((of_error(error) if isinstance(error, errors.FleetMapError) else of_bug(error)).body)
+
+
 def of_http(error: HTTPException) -> Response:
     """The answer for Starlette's and FastAPI's own errors (no route, wrong method …)."""
     if error.status_code in (204, 304):

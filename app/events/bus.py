@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import re
 import threading
 import time
 from collections import OrderedDict
@@ -22,7 +23,7 @@ from typing import Any, Literal
 import zenoh
 from zenoh import ext
 
-from app.errors import FleetMapError, Unavailable
+from app.errors import Invalid, Problem, Unavailable
 from app.events import messages
 from app.events.router import Router
 from app.events.security import Security
@@ -37,8 +38,14 @@ PUBLISHERS = 4096
 
 HEARTBEAT_SECONDS = 0.3
 THREADS = 4
+"""So many queries are looked at at once, and so many more maps are made for them: who asks for what is there does not
+wait for what is being made."""
+
 WAITING = 256
 """Queries that may wait; further ones are told so."""
+
+RESTART_SECONDS = 8.0
+"""Longest pause before a router of ours that could not be started is tried again."""
 
 CONNECT_SECONDS = 10.0
 
@@ -66,8 +73,13 @@ class Answer:
     encoding: str
 
 
-Ask = Callable[[str, str, Mapping[str, str]], Answer]
-"""(environment, the key after it, parameters) -> answer. Raises FleetMapError."""
+Make = Callable[[], Answer]
+
+Ask = Callable[[str, str, Mapping[str, str]], Answer | Make]
+"""(environment, the key after it, parameters) -> the answer, or what takes long and then gives it. Either may raise."""
+
+Explain = Callable[[Exception], bytes]
+"""What went wrong -> the problem's JSON, as it is told over HTTP."""
 
 OnStatus = Callable[[str, str, bytes], None]
 """(environment, robot, payload). It must return at once."""
@@ -142,17 +154,21 @@ def _set(config: zenoh.Config, key: str, value: Any) -> None:
 class Bus:
     """One session, opened again where it breaks. All methods are thread-safe."""
 
-    def __init__(self, options: BusOptions, *, ask: Ask, on_status: OnStatus, on_alive: OnAlive) -> None:
+    def __init__(
+        self, options: BusOptions, *, ask: Ask, explain: Explain, on_status: OnStatus, on_alive: OnAlive
+    ) -> None:
         self.options = options
-        self._ask, self._on_status, self._on_alive = ask, on_status, on_alive
+        self._ask, self._explain, self._on_status, self._on_alive = ask, explain, on_status, on_alive
         self._session: zenoh.Session | None = None
         self._router: Router | None = None
         self._held: list[Any] = []
         self._publishers: OrderedDict[str, ext.AdvancedPublisher] = OrderedDict()
         self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="fleetmap-zenoh")
+        self._makers = ThreadPoolExecutor(THREADS, thread_name_prefix="fleetmap-zenoh-make")
         self._waiting = threading.Semaphore(WAITING)
         self._lock = threading.RLock()
         self._problem = "not connected yet"
+        self._restart, self._pause = 0.0, 0.0
         self.opened = 0
 
     @property
@@ -178,18 +194,23 @@ class Bus:
                 if self._router is not None:
                     self._router.close()
                     self._router = None
+                if time.monotonic() < self._restart:
+                    return False
                 router = Router(router_configuration(self.options))
                 if router.problem is not None:
-                    self._problem = f"the router cannot listen on {self.options.listen}: {router.problem}"
+                    self._problem = f"the router cannot listen on {self.options.listen}: {plain(router.problem)}"
+                    self._pause = min(RESTART_SECONDS, 2 * self._pause or 0.5)
+                    self._restart = time.monotonic() + self._pause
                     return False
-                self._router = router
+                self._router, self._pause = router, 0.0
+                self._problem = f"the router at {self.where} has started: it is looked for"
             if self._session is not None:
                 return self.connected
             try:
                 self._session = zenoh.open(zenoh.Config.from_json5(session_configuration(self.options)))
                 self._declare(self._session)
             except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
-                self._problem = f"no router at {self.where}: {str(error).splitlines()[0][:300]}"
+                self._problem = f"no router at {self.where}: {plain(str(error))}"
                 self._close_session()
                 return False
             self.opened += 1
@@ -200,7 +221,10 @@ class Bus:
         router = self._router
         if self._session is None or (router is not None and not router.alive):
             return self.open() and self.connected
-        return self.connected
+        if self.connected:
+            return True
+        self._problem = f"the router at {self.where} is gone: it is looked for"
+        return False
 
     def publish(self, environment: str, body: Mapping[str, Any]) -> None:
         """Put an event. It stays in the publisher's cache for who joins late or missed it."""
@@ -219,7 +243,8 @@ class Bus:
 
     def close(self) -> None:
         """Undeclare, close the session, end the router."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        for threads in (self._threads, self._makers):
+            threads.shutdown(wait=False, cancel_futures=True)
         with self._lock:
             self._close_session()
             if self._router is not None:
@@ -270,11 +295,12 @@ class Bus:
     # --- zenoh's threads: hand over, do nothing else ---
 
     def _status(self, sample: zenoh.Sample) -> None:
-        if sample.kind != zenoh.SampleKind.PUT:
-            return
         pieces = str(sample.key_expr).removeprefix(self.options.prefix + "/").split("/")
+        if sample.kind != zenoh.SampleKind.PUT or len(pieces) != 4:  # a key with ``**`` comes here as well
+            return
+        environment, _, robot, _ = pieces
         payload = bytes(sample.payload) if len(sample.payload) <= messages.MAX_STATUS_BYTES else b""
-        self._hand_over(self._on_status, pieces[0], pieces[2], payload)
+        self._hand_over(self._on_status, environment, robot, payload)
 
     def _alive(self, sample: zenoh.Sample) -> None:
         robot = str(sample.key_expr).rpartition("/")[2]
@@ -284,8 +310,11 @@ class Bus:
         if not self._waiting.acquire(blocking=False):
             self._refuse(query, Unavailable("too many queries wait: try again in a few seconds"))
             return
+        self._submit(self._threads, query, self._look)
+
+    def _submit(self, threads: ThreadPoolExecutor, query: zenoh.Query, find: Callable[[zenoh.Query], Any]) -> None:
         try:
-            self._threads.submit(self._answer, query)
+            threads.submit(self._answer, query, find)
         except RuntimeError:  # closing
             self._waiting.release()
             _drop(query)
@@ -298,37 +327,37 @@ class Bus:
         except Exception:
             log.exception("a message over Zenoh could not be taken")
 
-    def _answer(self, query: zenoh.Query) -> None:
-        try:
-            key = str(query.key_expr)
-            if "*" in key:
-                raise Unavailable("ask for one map at a time: a key without wildcards")
-            environment, _, rest = key.removeprefix(self.options.prefix + "/").partition("/")
-            parameters = _parameters(query)
-            answer = self._ask(environment, rest, parameters)
-            if len(answer.payload) > self.options.max_reply_bytes:
-                raise Unavailable(
-                    f"the map has {len(answer.payload)} bytes, more than is sent over Zenoh "
-                    f"({self.options.max_reply_bytes}): fetch it over HTTP"
-                )
-            query.reply(key, answer.payload, encoding=answer.encoding)
-        except FleetMapError as error:
-            self._refuse(query, error)
-        except Exception:
-            log.exception("a query over Zenoh failed")
-            self._refuse(query, Unavailable("the server made a mistake; its log says where"))
-        finally:
-            self._waiting.release()
-            with contextlib.suppress(Exception):
-                _drop(query)
+    def _look(self, query: zenoh.Query) -> Answer | Make:
+        key = str(query.key_expr)
+        if "*" in key:
+            raise Invalid("ask for one map at a time: a key without wildcards")
+        environment, _, rest = key.removeprefix(self.options.prefix + "/").partition("/")
+        return self._ask(environment, rest, _parameters(query))
 
-    @staticmethod
-    def _refuse(query: zenoh.Query, error: FleetMapError) -> None:
-        body: dict[str, Any] = {"title": type(error).__name__, "detail": error.detail}
-        if error.problems:
-            body["errors"] = [p.as_dict() for p in error.problems]
+    def _answer(self, query: zenoh.Query, find: Callable[[zenoh.Query], Answer | Make]) -> None:
+        """In a thread of ours: what ``find`` finds is the answer, or is left to the makers."""
+        try:
+            found = find(query)
+            if not isinstance(found, Answer):
+                make = found
+                self._submit(self._makers, query, lambda _: make())
+                return
+            with contextlib.suppress(zenoh.ZError):  # who asked is gone
+                query.reply(query.key_expr, found.payload, encoding=found.encoding)
+        except Exception as error:  # noqa: BLE001  told, and logged where it is a mistake of ours
+            self._refuse(query, error)
+        self._waiting.release()
         with contextlib.suppress(Exception):
-            query.reply_err(messages.dumps(body), encoding="application/problem+json")
+            _drop(query)
+
+    def _refuse(self, query: zenoh.Query, error: Exception) -> None:
+        with contextlib.suppress(zenoh.ZError):
+            query.reply_err(self._explain(error), encoding="application/problem+json")
+
+
+def plain(said: str) -> str:
+    """The first line of what Zenoh says, without the places in its source."""
+    return re.sub(r",? at /\S+", "", said.splitlines()[0] if said else "")[:300]
 
 
 def _end(held: Any) -> None:
@@ -344,12 +373,15 @@ def _drop(query: Any) -> None:
 
 
 def _parameters(query: zenoh.Query) -> dict[str, str]:
-    """A selector's parameters, ``grid=keepout;derive=false``."""
-    out = {}
+    """A selector's parameters, ``grid=keepout;derive=false``. Invalid for what is given twice."""
+    out: dict[str, str] = {}
     for pair in str(query.parameters).split(";"):
         name, _, value = pair.partition("=")
-        if name and not name.startswith("_"):  # those with an underscore are Zenoh's own
-            out[name] = value
+        if not name or name.startswith("_"):  # those with an underscore are Zenoh's own
+            continue
+        if name in out:
+            raise Invalid(f"the parameter {name[:80]!r} is given twice", [Problem("given twice", where=name[:80])])
+        out[name] = value
     return out
 
 

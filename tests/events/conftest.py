@@ -75,6 +75,12 @@ def eventually(condition: Callable[[], Any], seconds: float = 20.0) -> Any:
         time.sleep(0.02)
 
 
+def said(n: int, state: str = "active") -> bytes:
+    """What a robot says: that it holds version ``n``."""
+    body = {"channel": "latest", "version": n, "root": f"{n:064x}", "state": state, "sequence": n}
+    return json.dumps(body).encode()
+
+
 @pytest.fixture
 def port() -> int:
     return free_port()

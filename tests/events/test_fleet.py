@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from typing import Any
@@ -14,13 +13,8 @@ from app.errors import Unavailable
 from app.fleet import Intake
 from app.store import Store
 from tests.api.conftest import Api
-from tests.events.conftest import client_config, eventually
+from tests.events.conftest import client_config, eventually, said
 from tests.events.test_relay import router_of
-
-
-def said(n: int, state: str = "active") -> bytes:
-    body = {"channel": "latest", "version": n, "root": f"{n:064x}", "state": state, "sequence": n}
-    return json.dumps(body).encode()
 
 
 def robot_of(api: Api, name: str) -> Any:

@@ -25,8 +25,8 @@ from app.main import check_bus as check_settings
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 from tests.certificates import Authority
-from tests.events.conftest import Listener, client_config, eventually, free_port
-from tests.events.test_fleet import robot_of, said
+from tests.events.conftest import Listener, client_config, eventually, free_port, said
+from tests.events.test_fleet import robot_of
 from tests.events.test_ros2 import GRID, STRING, Heard, grid_of, tokens
 
 REFUSED_SECONDS = 1.0

@@ -1,0 +1,160 @@
+"""Maps and versions asked for over Zenoh, and what else comes in from the bus: the same answers as over HTTP."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from app.errors import Damaged
+from tests.api import samples
+from tests.api.conftest import Api, running, settings_for
+from tests.api.conftest import problem as problem_of
+from tests.events.conftest import client_config, eventually, free_port, said
+
+
+@pytest.fixture(scope="module")
+def port() -> int:
+    return free_port()
+
+
+@pytest.fixture(scope="module")
+def api(tmp_path_factory: pytest.TempPathFactory, port: int) -> Iterator[Api]:
+    where = f"tcp/127.0.0.1:{port}"
+    with running(settings_for(tmp_path_factory.mktemp("asked"), zenoh_mode="router", zenoh_listen=where)) as api:
+        eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
+        yield api
+
+
+def test_maps_over_zenoh_are_the_bytes_of_http(api: Api, session: zenoh.Session) -> None:
+    api.post("environments", {"name": "asked"})
+    api.upload("asked", {"network.tmap2.yaml": samples.tmap2()})
+    api.upload("asked", samples.grid())
+
+    def get(key: str) -> Any:
+        reply = next(iter(session.get(key, timeout=20.0)))
+        return reply.ok if reply.ok is not None else reply.err
+
+    for version in ("1", "latest"):
+        here = get(f"fleetmap/asked/{version}/maps/tmap2/network.tmap2.yaml")
+        there = api.get(f"environments/asked/versions/{version}/maps/tmap2/network.tmap2.yaml")
+        assert bytes(here.payload) == there.content
+        assert str(here.encoding) in there.headers["content-type"]
+    grid = get("fleetmap/asked/latest/maps/occupancy_grid/map.yaml?resolution=0.5")
+    assert bytes(grid.payload) == api.get("/maps/asked/occupancy_grid/map.yaml?resolution=0.5").content
+    version = json.loads(bytes(get("fleetmap/asked/2/version").payload))
+    assert version == api.get("environments/asked/versions/2").json()
+    for path, options in (
+        ("asked/latest/maps/nothing/x", ""),
+        ("asked/99/version", ""),
+        ("nowhere/latest/version", ""),
+        ("asked/latest/maps/tmap2/other.yaml", ""),
+        ("asked/latest/maps/occupancy_grid", "resolution=nan"),
+        ("asked/latest/maps/occupancy_grid", "resolution=0.5;resolution=0.1"),
+        ("asked/latest/maps/occupancy_grid", "colour=red"),
+        ("asked/latest/maps/osm", ""),
+    ):
+        environment, _, rest = path.partition("/")
+        there = api.get(f"environments/{environment}/versions/{rest.removesuffix('/version')}", expect=None, params=[
+            tuple(pair.split("=")) for pair in options.split(";") if pair
+        ])  # fmt: skip
+        refused = get(f"fleetmap/{path}?{options}")
+        assert json.loads(bytes(refused.payload)) == problem_of(there)
+        assert str(refused.encoding) == "application/problem+json"
+    for key in ("fleetmap/*/*/version", "fleetmap/asked/latest/maps/**", "**"):
+        told = json.loads(bytes(get(key).payload))
+        assert (told["status"], "without wildcards" in told["detail"]) == (422, True)
+
+
+def test_a_map_in_the_making_keeps_nobody_waiting(
+    api: Api, session: zenoh.Session, port: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    api.post("environments", {"name": "busy"})
+    api.upload("busy", {"network.tmap2.yaml": samples.tmap2()})
+    go, maps, late = threading.Event(), api.app.state.services.maps, []
+    make = maps.at_once
+
+    def slow(*asked: Any, **more: Any) -> Any:
+        assert go.wait(30)
+        return make(*asked, **more)
+
+    monkeypatch.setattr(maps, "at_once", slow)
+    try:
+        for _ in range(10):
+            session.get("fleetmap/busy/latest/maps/geojson/map.geojson", late.append, timeout=30.0)
+        with zenoh.open(client_config(port)) as leaves:
+            leaves.get("fleetmap/busy/latest/maps/geojson", lambda _: None, timeout=30.0)
+            quick = next(iter(session.get("fleetmap/busy/1/version", timeout=20.0)))
+        assert quick.ok is not None
+        assert not late
+    finally:
+        go.set()
+    eventually(lambda: len(late) == 10)
+    assert len({bytes(reply.ok.payload) for reply in late}) == 1
+    assert not [r for r in caplog.records if r.levelname == "ERROR"], "who left before the answer is no error"
+
+
+def test_what_is_too_large_for_zenoh_is_not_even_read(
+    api: Api, session: zenoh.Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    api.post("environments", {"name": "large"})
+    api.upload("large", samples.grid())
+    ready = api.app.state.services.maps.ready
+    api.get("/maps/large/occupancy_grid/map.pgm")
+
+    def huge(recipe: Any) -> Any:
+        made = ready(recipe)
+        return replace(made, files=tuple(replace(f, size=2**40, path=Path("/nowhere")) for f in made.files))
+
+    monkeypatch.setattr(api.app.state.services.maps, "ready", huge)
+    reply = next(iter(session.get("fleetmap/large/latest/maps/occupancy_grid/map.pgm", timeout=20.0)))
+    told = json.loads(bytes(reply.err.payload))
+    assert (told["status"], told["title"]) == (413, "Too large")
+    assert "1099511627776 bytes, more than is sent over Zenoh (67108864): fetch it over HTTP" in told["detail"]
+
+
+def test_damaged_data_is_an_alarm_over_zenoh_too(
+    api: Api, session: zenoh.Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    api.post("environments", {"name": "rotten"})
+    for error, level in ((Damaged("chunk 4711 has other bytes"), "CRITICAL"), (KeyError("a secret"), "ERROR")):
+
+        def fail(*_: Any, error: Exception = error) -> Any:
+            raise error
+
+        with monkeypatch.context() as patch:
+            patch.setattr(api.app.state.services.store, "version", fail)
+            reply = next(iter(session.get("fleetmap/rotten/0/version", timeout=20.0)))
+        assert json.loads(bytes(reply.err.payload))["status"] == 500
+        assert [r.levelname for r in caplog.records if r.levelname == level]
+    assert "a secret" not in caplog.text
+
+
+def test_keys_with_wildcards_are_nobodys_status(
+    api: Api, session: zenoh.Session, caplog: pytest.LogCaptureFixture
+) -> None:
+    api.post("environments", {"name": "wild"})
+    for key in (
+        "**",
+        "fleetmap/**",
+        "fleetmap/**/status",
+        "fleetmap/*/robots/*/status",
+        "fleetmap/wild/robots/r$*/status",
+    ):
+        session.put(key, said(5))
+    session.delete("fleetmap/wild/robots/r1/status")
+    session.put("fleetmap/wild/robots/r2/status", said(1))
+    eventually(lambda: api.get("robots/r2", expect=None).status_code == 200)
+    assert [r["robot"] for r in api.get("robots?environment=wild").json()] == ["r2"]
+    assert not [r for r in caplog.records if r.levelname == "ERROR"]
+
+
+def test_the_server_is_alive(api: Api, session: zenoh.Session) -> None:
+    tokens = [str(r.ok.key_expr) for r in session.liveliness().get("fleetmap/server", timeout=5.0) if r.ok]
+    assert tokens == ["fleetmap/server"]
