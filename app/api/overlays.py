@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import logging
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
-from typing import Annotated, Literal
+from functools import partial
+from typing import Annotated, Any, Literal
 
+import shapely
 from fastapi import APIRouter, Query
 from starlette.responses import Response
 
@@ -13,13 +17,16 @@ from app.api.access import Editor, Reporter, Viewer
 from app.api.answers import Route, answer
 from app.api.schemas import EnvironmentPath, OverlayBody, OverlayOut, OverlayPath, told
 from app.api.services import Here, Services
-from app.errors import Conflict, FleetMapError, Invalid, Problem
+from app.errors import Conflict, FleetMapError, Invalid, MissingDatum, Problem
 from app.fleet import overlays
-from app.ingest.edits import edit_changes
+from app.ingest.edits import edit_changes, shape_of
 from app.model.frame import GROUND
 from app.store.values import Overlay, rfc3339
 
 log = logging.getLogger(__name__)
+
+MAX_POINTS = 1000
+"""Of a reported polygon: it goes to every robot in an event."""
 
 router = APIRouter(prefix="/environments/{env}/overlays", tags=["overlays"], route_class=Route)
 
@@ -54,14 +61,21 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, here: Here, who: Rep
     head = here.store.version(env)
     now = datetime.now(UTC)
     crs = None if body.polygon is None else body.crs or ("wgs84" if head.datum else "local")
+    if crs == "wgs84" and head.datum is None:
+        raise MissingDatum(
+            f"{env} has no datum, so degrees have no place in its maps: give the polygon in local metres"
+        )
     level = body.level or GROUND
     if body.edge is not None:
         level = overlays.edge_of(here.store, head, body.edge)[0].level
+    elif level not in (names := [known.name for known in head.levels]):
+        known = ", ".join(names)[:500]
+        raise Invalid(f"{env} has no level {level[:80]!r}; it has {known}", [Problem("no such level", where="level")])
     wanted = Overlay(
         environment=env,
         kind=body.kind,
         level=level,
-        polygon=body.polygon,
+        polygon=None if body.polygon is None else _polygon(body.polygon),
         edge=body.edge,
         crs=crs,
         detail=body.detail,
@@ -69,9 +83,20 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, here: Here, who: Rep
         created=now,
         expires=now + timedelta(seconds=body.ttl_seconds),
     )
-    edit_changes(here.store, head, overlays.accepting(here.store, head, wanted))  # Invalid now, not for the editor
+    if changes := overlays.accepting(here.store, head, wanted):
+        edit_changes(here.store, head, changes)  # Invalid now, not for the editor
     overlay, new = here.store.add_overlay(wanted)
     return answer(overlay.as_dict(), 201 if new else 200)
+
+
+def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The GeoJSON geometry and nothing else that came with it: all robots are told of it."""
+    shape = shape_of(given)
+    if (count := int(shapely.get_num_coordinates(shape))) > MAX_POINTS:
+        problem = f"has {count} points, at most {MAX_POINTS} are taken: send its outline with fewer"
+        raise Invalid(f"the polygon {problem}", [Problem(problem, where="body.polygon")])
+    clean: dict[str, Any] = json.loads(shapely.to_geojson(shape))
+    return clean
 
 
 @router.post(
@@ -90,7 +115,9 @@ def accept_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Edito
     try:
         version = _edit(here, known, ending=False, author=who.name)
     except FleetMapError:
-        here.store.decide_overlay(env, id, "accepted", "pending", who.name, now)
+        # It may be in the map all the same: another editor was at it too, or the database's answer was lost.
+        if not overlays.ending(here.store, here.store.version(env), known):
+            here.store.decide_overlay(env, id, "accepted", "pending", who.name, now)
         raise
     return answer(here.store.note_overlay_version(env, id, version).as_dict())
 
@@ -104,16 +131,17 @@ def reject_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Edito
 
 def _edit(here: Services, overlay: Overlay, *, ending: bool, author: str) -> int:
     """The version that an overlay is in, or is out of; the same one where this is done twice."""
-    head = here.store.version(overlay.environment)
-    changes = (overlays.ending if ending else overlays.accepting)(here.store, head, overlay)
-    if not changes:
-        return head.number
+    edits = partial(overlays.ending if ending else overlays.accepting, here.store)
     what = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
     message = f"{what} is free again" if ending else f"{what} is blocked until {rfc3339(overlay.expires)}"
-    outcome = here.ingest.edit(
-        overlay.environment, changes, message=f"{message} (reported by {overlay.reporter})", author=author
+    outcome = here.ingest.amend(
+        overlay.environment,
+        lambda head: edits(head, overlay),
+        message=f"{message} (reported by {overlay.reporter})",
+        author=author,
     )
-    return outcome.version.number if outcome.version else head.number
+    assert outcome.version is not None
+    return outcome.version.number
 
 
 def end_overlays(here: Services, now: datetime) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from datetime import datetime
 from typing import Any
 
 import shapely
@@ -21,9 +22,13 @@ BLOCKED, UNTIL = "blocked", "blocked_until"
 
 
 def accepting(store: Store, head: Version, overlay: Overlay) -> list[dict[str, Any]]:
-    """The edits that put an overlay into a version. Raises Invalid where its edge is not there."""
+    """The edits that put an overlay into a version; none where the edge is blocked for as long already. Raises Invalid
+    where its edge is not there.
+    """
     if overlay.edge is not None:
         key, edge = edge_of(store, head, overlay.edge)
+        if _blocked(edge, overlay.expires):
+            return []
         return [_put(key, edge, {**edge.properties, BLOCKED: True, UNTIL: rfc3339(overlay.expires)})]
     about = {"id": overlay.id, "reporter": overlay.reporter}
     properties: dict[str, Any] = {"kind": "keepout", "expires": rfc3339(overlay.expires), "overlay": about}
@@ -64,6 +69,17 @@ def edge_of(store: Store, head: Version, edge: str) -> tuple[PartKey, Feature]:
         f"{head.environment} has no edge {edge[:80]!r} in version {head.number}",
         [Problem("no such edge", where="edge")],
     )
+
+
+def _blocked(edge: Feature, until: datetime) -> bool:
+    """Whether an edge is blocked until a time, or later: by an overlay, or by an editor without an end."""
+    if edge.properties.get(BLOCKED) is not True:
+        return False
+    try:
+        end = datetime.fromisoformat(edge.properties[UNTIL])
+    except (KeyError, TypeError, ValueError):
+        return UNTIL not in edge.properties
+    return end.tzinfo is not None and end >= until
 
 
 def _put(key: PartKey, edge: Feature, properties: Mapping[str, Any]) -> dict[str, Any]:

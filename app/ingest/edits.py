@@ -255,7 +255,7 @@ class _Session:
         elif before is not None:
             geometry, local = self._as_before(before, geometry, local)
         if before is None or geometry is not before[0]:
-            _check_shape(what, item, geometry)
+            _checkshape_of(what, item, geometry)
         draft.deletes.discard(item)
         draft.dragged.discard(item)
         draft.puts[item] = (geometry, dict(properties), local)
@@ -363,7 +363,7 @@ class _Session:
         shape = place if place is not None else feature.get("geometry")
         if shape is None:
             return None, local
-        return _shape(shape), local
+        return shape_of(shape), local
 
     def _is_local(self, change: Mapping[str, Any]) -> bool:
         crs = change.get("crs") or ("wgs84" if self._base.datum is not None else "local")
@@ -380,7 +380,7 @@ class _Session:
         grid, value = self._grids[key], change.get("value")
         if isinstance(value, bool) or not isinstance(value, int) or not (0 <= value <= OCCUPIED or value == UNKNOWN):
             raise Invalid(f"value must be 0 to 100, or 255 for unknown, got {value!r}")
-        polygon = _shape(change.get("polygon"))
+        polygon = shape_of(change.get("polygon"))
         if polygon.geom_type not in ("Polygon", "MultiPolygon") or not polygon.is_valid:
             reason = shapely.is_valid_reason(polygon)
             raise Invalid(f"polygon must be a valid GeoJSON Polygon or MultiPolygon, got {polygon.geom_type}: {reason}")
@@ -443,7 +443,8 @@ def cells_within(grid: OccupancyGrid, polygon: Any) -> np.ndarray[Any, np.dtype[
     return mask
 
 
-def _shape(geometry: Any) -> Any:
+def shape_of(geometry: Any) -> Any:
+    """A GeoJSON geometry; Invalid where it is none."""
     if not isinstance(geometry, Mapping):
         raise Invalid(f"a geometry must be a GeoJSON object, got {type(geometry).__name__}")
     try:
@@ -466,7 +467,7 @@ def _near(a: Any, b: Any, tolerance: float) -> bool:
     return bool(np.allclose(ours, theirs, rtol=0.0, atol=SAME_METRES, equal_nan=True))
 
 
-def _check_shape(what: str, item: str, geometry: Any) -> None:
+def _checkshape_of(what: str, item: str, geometry: Any) -> None:
     """Refuse a node that is no point, an edge that is no line, a fence or zone that is no polygon."""
     allowed = _SHAPES.get(what)
     if allowed is None or (geometry.geom_type in allowed and not geometry.is_empty):

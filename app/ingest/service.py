@@ -135,8 +135,29 @@ class Ingest:
             reason = f"nested deeper than {MAX_DEPTH} lists and objects"
             raise Invalid(f"the changes are {reason}", [Problem(reason, where="changes")])
         key = _idempotency(idempotency, _digest(["edit", list(changes), message]))
+        return self._edit(environment, lambda _: changes, message, author, if_match, key)
 
+    def amend(
+        self, environment: str, edits: Callable[[Version], Sequence[Mapping[str, Any]]], *, message: str, author: str
+    ) -> Outcome:
+        """Edits that follow from the version they are made on. Where the head moves meanwhile ``edits`` is asked again,
+        so that nothing of what others wrote is put back; where it finds none, nothing changes.
+        """
+        return self._edit(environment, edits, message, author, None, None)
+
+    def _edit(
+        self,
+        environment: str,
+        edits: Callable[[Version], Sequence[Mapping[str, Any]]],
+        message: str,
+        author: str,
+        if_match: str | None,
+        key: Idempotency | None,
+    ) -> Outcome:
         def once(base: Version) -> Outcome:
+            changes = edits(base)
+            if not changes and key is None:
+                return Outcome("unchanged", base, base.as_dict())
             wanted, warnings = edit_changes(self._store, base, changes)
             prepared: Prepared = self._in_worker(prepare_changes, base, wanted)
             return self._commit(environment, base, prepared, author, message, (), warnings, key)

@@ -22,6 +22,9 @@ from app.store.values import Overlay, OverlayState
 MAX_PENDING: Final = 1000
 """So many overlays of an environment may wait for a decision."""
 
+MAX_OF_ONE: Final = 100
+"""So many of them may one reporter have: one that goes wild leaves room for the others."""
+
 MAX_LISTED: Final = 10_000
 TOLD: Final[Mapping[OverlayState, outbox.EventType]] = {"rejected": "overlay.rejected", "ended": "overlay.ended"}
 """What deciding tells. An acceptance is told once its version is known."""
@@ -47,12 +50,15 @@ class Overlays(Base):
             row = environment_row(connection, wanted.environment, lock=True)
             pending = (table.c.environment_id == row.id, table.c.state == "pending")
             own = select(table).where(*pending, table.c.reporter == wanted.reporter, table.c.expires > wanted.created)
-            for known in connection.execute(own):
+            theirs = connection.execute(own).all()
+            for known in theirs:
                 same = (known.kind, known.level, known.polygon, known.edge, known.crs)
                 if same == (wanted.kind, wanted.level, wanted.polygon, wanted.edge, wanted.crs):
                     values = {"expires": wanted.expires, "detail": wanted.detail}
                     connection.execute(update(table).where(table.c.id == known.id).values(values))
                     return _read(connection, row, known.id), False
+            if len(theirs) >= MAX_OF_ONE:
+                raise Conflict(f"{MAX_OF_ONE} overlays of {wanted.reporter} wait for a decision: no more are taken")
             waiting = select(func.count()).select_from(table).where(*pending)
             if connection.execute(waiting).scalar_one() >= MAX_PENDING:
                 raise Conflict(f"{MAX_PENDING} overlays of {wanted.environment} wait: accept or reject some")
@@ -78,14 +84,16 @@ class Overlays(Base):
             return made, True
 
     def overlays(self, environment: str, state: OverlayState | None = None) -> list[Overlay]:
-        """An environment's overlays, oldest first; NotFound."""
+        """An environment's overlays, oldest first, of very many the newest; NotFound."""
         table = tables.overlay
+        newest = (table.c.created.desc(), table.c.id.desc())
         with self._database.read() as connection:
             row = environment_row(connection, environment)
-            query = select(table).where(table.c.environment_id == row.id).order_by(table.c.created, table.c.id)
+            query = select(table).where(table.c.environment_id == row.id).order_by(*newest)
             if state is not None:
                 query = query.where(table.c.state == state)
-            return [_as_overlay(environment, r) for r in connection.execute(query.limit(MAX_LISTED))]
+            rows = connection.execute(query.limit(MAX_LISTED)).all()
+        return [_as_overlay(environment, r) for r in reversed(rows)]
 
     def overlay(self, environment: str, id: str) -> Overlay:
         """One overlay; NotFound."""
@@ -112,12 +120,18 @@ class Overlays(Base):
             return decided
 
     def note_overlay_version(self, environment: str, id: str, version: int) -> Overlay:
-        """The version that an accepted overlay went into: now it is told of."""
+        """The version that an accepted overlay went into: now it is told of.
+
+        It counts as accepted whatever was decided meanwhile: it is in the map, and has to be taken out again.
+        """
         table = tables.overlay
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
             before = _read(connection, row, id)
-            connection.execute(update(table).where(table.c.id == id).values(version=version))
+            values: dict[str, Any] = {"version": version}
+            if before.state != "ended":
+                values["state"] = "accepted"
+            connection.execute(update(table).where(table.c.id == id).values(values))
             noted = _read(connection, row, id)
             if before.version is None and noted.state == "accepted":
                 _tell(connection, row, noted, "overlay.accepted", noted.decided_by or "", utcnow())

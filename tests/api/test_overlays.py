@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from app.api.overlays import end_overlays
 from app.errors import Unavailable
 from app.events.messages import Event
+from app.fleet import overlays
 from tests.api.conftest import Api
 
 SQUARE = {"type": "Polygon", "coordinates": [[[1, 1], [4, 1], [4, 3], [1, 3], [1, 1]]]}
@@ -100,6 +102,86 @@ def test_a_blocked_edge(api: Api, farm: str) -> None:
     assert roots[0] == roots[1], "nothing of it stays"
 
 
+@pytest.mark.parametrize("first", [2, 3600])
+def test_an_edge_that_two_report_is_blocked_until_the_later_end(api: Api, farm: str, first: int) -> None:
+    url = f"environments/{farm}/overlays"
+    before = edge(api, farm, "gate_barn")
+    said = {}
+    for seconds in (first, 3602 - first):
+        robot = api.token_for("robot", robot=f"for-{seconds}")
+        said[seconds] = robot.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": seconds}).json()
+        api.post(f"{url}/{said[seconds]['id']}/accept", expect=200)
+    until(lambda: [o["id"] for o in api.get(f"{url}?state=ended").json()] == [said[2]["id"]])
+    assert edge(api, farm, "gate_barn")["properties"]["blocked_until"] == said[3600]["expires"]
+    end_overlays(api.app.state.services, datetime.now(UTC) + timedelta(hours=2))
+    assert edge(api, farm, "gate_barn") == before
+
+
+def test_what_an_editor_blocked_stays_blocked(api: Api, farm: str) -> None:
+    """An overlay's end does not free an edge that is blocked without an end."""
+    url = f"environments/{farm}/overlays"
+    feature = edge(api, farm, "gate_barn")
+    feature["properties"]["blocked"] = True
+    feature["properties"].pop("level", None)
+    put = {"op": "put", "layer": "topology", "level": "ground", "feature": feature}
+    api.post(f"environments/{farm}/edits", {"changes": [put]})
+    told = api.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": 1}).json()
+    assert api.post(f"{url}/{told['id']}/accept", expect=200).json()["version"] == 4
+    until(lambda: api.get(f"{url}?state=ended").json())
+    assert edge(api, farm, "gate_barn")["properties"]["blocked"] is True
+    assert api.get(f"environments/{farm}").json()["version"] == 4
+
+
+def test_what_others_write_meanwhile_is_not_put_back(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between an acceptance's look at the edge and its version an editor changes the same edge."""
+    url = f"environments/{farm}/overlays"
+    told = api.post(url, {"kind": "blocked", "edge": "gate_barn"}).json()
+    feature = edge(api, farm, "gate_barn")
+    feature["properties"] |= {"surface": "gravel"}
+    feature["properties"].pop("level", None)
+    put = {"op": "put", "layer": "topology", "level": "ground", "feature": feature}
+    look, meanwhile = overlays.edge_of, iter([put])
+
+    def slow(*args: Any) -> Any:
+        found = look(*args)
+        for change in meanwhile:
+            api.as_(api.token).post(f"environments/{farm}/edits", {"changes": [change]})
+        return found
+
+    monkeypatch.setattr(overlays, "edge_of", slow)
+    assert api.post(f"{url}/{told['id']}/accept", expect=200).json()["version"] == 5
+    now = edge(api, farm, "gate_barn")["properties"]
+    assert (now["surface"], now["blocked"]) == ("gravel", True)
+
+
+def test_a_polygon_is_kept_without_what_came_along(api: Api, farm: str, bare: str) -> None:
+    url = f"environments/{farm}/overlays"
+    said = {"kind": "blocked", "crs": "local", "polygon": {**SQUARE, "properties": {"x": "y" * 5000}, "crs": {}}}
+    assert api.post(url, said).json()["polygon"] == SQUARE
+    assert api.post(url, {**said, "polygon": SQUARE}, 200).json()["polygon"] == SQUARE
+    round_ = [[math.cos(k / 500 * math.pi), math.sin(k / 500 * math.pi)] for k in range(1000)]
+    told = api.problem("POST", url, 422, json={**said, "polygon": {"type": "Polygon", "coordinates": [round_]}})
+    assert "1001 points" in told["detail"]
+    told = api.problem("POST", url, 422, json={**said, "level": "attic"})
+    assert "it has ground" in told["detail"]
+    assert (
+        "no datum" in api.problem("POST", f"environments/{bare}/overlays", 422, json={**said, "crs": "wgs84"})["detail"]
+    )
+
+
+def test_one_that_goes_wild_leaves_room(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.store.overlays.MAX_OF_ONE", 3)
+    url = f"environments/{farm}/overlays"
+    wild, calm = (api.token_for("robot", robot=name) for name in ("wild", "calm"))
+    squares = [{"type": "Polygon", "coordinates": [[[k, 0], [k + 1, 0], [k, 1], [k, 0]]]} for k in range(4)]
+    bodies = [{"kind": "blocked", "polygon": square, "crs": "local"} for square in squares]
+    for body in bodies[:3]:
+        wild.post(url, body)
+    assert "wild" in wild.problem("POST", url, 409, json=bodies[3])["detail"]
+    wild.post(url, bodies[0], 200)
+    calm.post(url, bodies[3])
+
+
 def test_undecided_overlays_expire(api: Api, farm: str) -> None:
     url = f"environments/{farm}/overlays"
     told = api.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": 1}).json()
@@ -178,7 +260,7 @@ def test_what_cannot_be_accepted_waits_on(api: Api, farm: str, monkeypatch: pyte
         raise Unavailable("busy")
 
     with monkeypatch.context() as patch:
-        patch.setattr(type(here.ingest), "edit", busy)
+        patch.setattr(type(here.ingest), "amend", busy)
         api.problem("POST", f"{url}/{told['id']}/accept", 503)
     (now,) = api.get(url).json()
     assert now["state"] == "pending"

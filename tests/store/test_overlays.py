@@ -87,3 +87,21 @@ def test_overlays_are_bounded_and_tidied(farm: Store, monkeypatch: pytest.Monkey
     farm.purge_environment("farm")
     farm.create_environment("farm")
     assert farm.overlays("farm") == []
+
+
+def test_what_went_into_a_version_is_accepted(farm: Store):
+    """Two editors accept at once; the one who failed takes his decision back before the other's version is noted."""
+    one, _ = farm.add_overlay(blocked())
+    farm.decide_overlay("farm", one.id, "pending", "accepted", "ann", NOW)
+    farm.decide_overlay("farm", one.id, "accepted", "pending", "bob", NOW)
+    noted = farm.note_overlay_version("farm", one.id, 0)
+    assert (noted.state, noted.version) == ("accepted", 0)
+    assert [e.body["type"] for e in farm.events("farm")][-1] == "overlay.accepted"
+    assert [o.id for o in farm.expire_overlays(NOW + timedelta(seconds=61))] == [one.id], "it is taken out again"
+
+
+def test_of_very_many_the_newest_are_listed(farm: Store, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(overlays, "MAX_LISTED", 2)
+    made = [farm.add_overlay(blocked(edge=f"e{k}", created=NOW + timedelta(seconds=k)))[0] for k in range(3)]
+    assert [o.edge for o in farm.overlays("farm")] == ["e1", "e2"]
+    assert made[0].edge == "e0"
