@@ -255,7 +255,7 @@ class _Session:
         elif before is not None:
             geometry, local = self._as_before(before, geometry, local)
         if before is None or geometry is not before[0]:
-            _checkshape_of(what, item, geometry)
+            _check_shape(what, item, geometry)
         draft.deletes.discard(item)
         draft.dragged.discard(item)
         draft.puts[item] = (geometry, dict(properties), local)
@@ -467,7 +467,7 @@ def _near(a: Any, b: Any, tolerance: float) -> bool:
     return bool(np.allclose(ours, theirs, rtol=0.0, atol=SAME_METRES, equal_nan=True))
 
 
-def _checkshape_of(what: str, item: str, geometry: Any) -> None:
+def _check_shape(what: str, item: str, geometry: Any) -> None:
     """Refuse a node that is no point, an edge that is no line, a fence or zone that is no polygon."""
     allowed = _SHAPES.get(what)
     if allowed is None or (geometry.geom_type in allowed and not geometry.is_empty):
