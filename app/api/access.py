@@ -104,7 +104,7 @@ def environment_of(path: str) -> str | None:
 
 
 class Access:
-    """Tokens, looked up in the store and believed for a second."""
+    """Tokens, looked up in the store and believed for a second. forgotten: how often one was revoked here."""
 
     def __init__(
         self,
@@ -119,7 +119,7 @@ class Access:
         self._known: OrderedDict[bytes, tuple[Principal, float]] = OrderedDict()
         self._sources: OrderedDict[str, deque[float]] = OrderedDict()
         self._lock = threading.Lock()
-        self._forgotten = 0
+        self.forgotten = 0
 
     def known(self, header: bytes | None) -> Principal | None:
         """Who sent this Authorization header, if it was checked less than a second ago. Never blocks."""
@@ -143,14 +143,14 @@ class Access:
             raise Throttled("too many wrong tokens came from your address: wait a minute and use a valid one")
         if header is None:
             raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
-        forgotten = self._forgotten
+        forgotten = self.forgotten
         token = self._find(_token(header)) if _token(header) else None
         if token is None or (token.expires is not None and token.expires <= datetime.now(UTC)):
             self._note_failure(source)
             raise Unauthenticated("the token is unknown or has expired: ask an administrator for a new one")
         principal = Principal.of(token)
         with self._lock:
-            if forgotten == self._forgotten:  # else it may have been revoked while it was looked up
+            if forgotten == self.forgotten:  # else it may have been revoked while it was looked up
                 self._known[hashlib.sha256(header).digest()] = (principal, self._clock() + FRESH_SECONDS)
             while len(self._known) > MAX_KNOWN:
                 self._known.popitem(last=False)
@@ -159,7 +159,7 @@ class Access:
     def forget(self) -> None:
         """Ask the store again for every token: one was revoked."""
         with self._lock:
-            self._forgotten += 1
+            self.forgotten += 1
             self._known.clear()
 
     def _failed(self, source: str) -> int:

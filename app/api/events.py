@@ -1,12 +1,16 @@
 """Events as server-sent events, resumable, and the same maps over Zenoh.
 
-A stream of one environment has its ``sequence`` as ids, a stream of several the place in the log of all.
+A stream of one environment has its ``sequence`` as ids, a stream of several the place in the log of all. Streams that
+stand at the same place share each look at the log. A stream ends soon after its token does.
 """
 
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Annotated, Any
 
 import orjson
@@ -14,13 +18,15 @@ from fastapi import APIRouter, Header, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response, StreamingResponse
 
-from app.api.access import Principal, Viewer
+from app.api.access import Access, Principal, Viewer
 from app.api.answers import Route
 from app.api.maps import number_of
+from app.api.problems import Throttled
 from app.api.schemas import told
 from app.api.services import Here, Services
+from app.api.together import Together
 from app.convert.cache import Made
-from app.errors import Invalid, NotFound, Problem, TooLarge, Unavailable
+from app.errors import Invalid, NotFound, Problem, TooLarge, Unauthenticated, Unavailable
 from app.events.bus import Answer, Make
 from app.store.values import Event
 
@@ -29,6 +35,9 @@ LOOK_SECONDS = 0.02
 
 POLL_SECONDS = 1.0
 KEEP_ALIVE_SECONDS = 15.0
+RECHECK_SECONDS = 5.0
+"""How long a stream goes on before its token is looked up again; one revoked in this process ends it at once."""
+
 PAGE = 200
 STREAMS = 1000
 """So many streams at once for each worker."""
@@ -36,11 +45,22 @@ STREAMS = 1000
 router = APIRouter(tags=["events"], route_class=Route)
 
 
+@dataclass(frozen=True, slots=True)
+class Told:
+    """An event as it goes out. number: its id in the stream."""
+
+    number: int
+    environment: str
+    line: bytes
+
+
 class Feed:
     """Who listens at this moment: all wait for one look at the store."""
 
     def __init__(self, here: Services) -> None:
         self._here = here
+        self._looks: Together[tuple[str | None, int, int], list[Told]] = Together()
+        self._checks: Together[tuple[bytes | None, str | None, int], Principal] = Together()
         self._changed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self.streams = 0
@@ -55,6 +75,23 @@ class Feed:
                 await changed.wait()
         except TimeoutError:
             return
+
+    async def events(self, environment: str | None, start: int) -> list[Told]:
+        """The next events after a place; all who stand there share a look. NotFound, Unavailable."""
+        key = (environment, start, self._here.store.generation())
+        return await self._looks.run(key, self._read, environment, start)
+
+    def _read(self, environment: str | None, start: int) -> list[Told]:
+        out = []
+        for event in self._here.store.events(environment, start, PAGE):
+            number = event.sequence if environment is not None else event.position
+            out.append(Told(number, event.environment, _line(event, number)))
+        return out
+
+    async def check(self, header: bytes | None, client: str | None) -> None:
+        """Look a token up: Unauthenticated, Throttled, Unavailable."""
+        key = (header, client, self._here.store.generation())
+        await self._checks.run(key, self._here.access.check, header, client)
 
     async def _look(self) -> None:
         seen = self._here.store.generation()
@@ -101,26 +138,64 @@ async def stream_events(
         if not (text.isascii() and text.isdigit() and len(text) <= 18):
             raise Invalid("Last-Event-ID is a number from an event's id", [Problem("not a number", where="id")])
         start = int(text)
-    if start is None:
-        start = await run_in_threadpool(_now, here, environment)
-    elif environment is not None:
-        await run_in_threadpool(here.store.events, environment, start, 1)  # NotFound comes before the stream
+    start = await run_in_threadpool(_begin, here, environment, start)  # NotFound comes before the stream
     feed: Feed = request.app.state.feed
     if feed.streams >= STREAMS:
         raise Unavailable("too many streams of events are open: close some, or poll with follow=false")
     headers = {"cache-control": "no-store", "x-accel-buffering": "no", "x-content-type-options": "nosniff"}
-    stream = _stream(here, feed, who, environment, start, follow=follow)
+    client = request.client.host if request.client else None
+    bearer = _Bearer(here.access, feed, who, request.headers.get("authorization"), client)
+    stream = _stream(feed, bearer, environment, start, follow=follow)
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 
-def _now(here: Services, environment: str | None) -> int:
-    if environment is None:
-        return here.store.last_position()
-    return here.store.last_sequence(environment)
+def _begin(here: Services, environment: str | None, start: int | None) -> int:
+    """Where a stream begins; without a start with what happens from now on.
+
+    NotFound for an environment that is not there, unless its end is still to be told. Invalid for a place that the log
+    has not come to: whoever was further has seen another log (one from before a backup was put back, say), and would
+    miss all that happens until then.
+    """
+    try:
+        newest = here.store.last_position() if environment is None else here.store.last_sequence(environment)
+    except NotFound:
+        if start is None or environment is None or not here.store.events(environment, start, 1):
+            raise
+        return start
+    if start is not None and start > newest:
+        reason = f"nothing with the number {start} has happened here, the last is {newest}: begin with a lower one"
+        raise Invalid(reason, [Problem("later than the log", where="since")])
+    return newest if start is None else start
+
+
+class _Bearer:
+    """Whether a stream's token is still one."""
+
+    def __init__(self, access: Access, feed: Feed, who: Principal, header: str | None, client: str | None) -> None:
+        self.who = who
+        self._access, self._feed, self._client = access, feed, client
+        self._header = None if header is None else header.encode("latin-1")
+        self._forgotten, self._checked = access.forgotten, time.monotonic()
+
+    async def stands(self) -> bool:
+        """Raises Unavailable where that cannot be known at this moment."""
+        if self._access.insecure:
+            return True
+        if self.who.expires is not None and self.who.expires <= datetime.now(UTC):
+            return False
+        forgotten, now = self._access.forgotten, time.monotonic()
+        if forgotten == self._forgotten and now - self._checked < RECHECK_SECONDS:
+            return True
+        try:
+            await self._feed.check(self._header, self._client)
+        except (Unauthenticated, Throttled):
+            return False
+        self._forgotten, self._checked = forgotten, now
+        return True
 
 
 async def _stream(
-    here: Services, feed: Feed, who: Principal, environment: str | None, start: int, *, follow: bool
+    feed: Feed, bearer: _Bearer, environment: str | None, start: int, *, follow: bool
 ) -> AsyncIterator[bytes]:
     feed.streams += 1
     try:
@@ -129,7 +204,9 @@ async def _stream(
         loop = asyncio.get_running_loop()
         while True:
             try:
-                page = await run_in_threadpool(here.store.events, environment, start, PAGE)
+                page = await feed.events(environment, start)
+                if not await bearer.stands():
+                    return
             except Unavailable:  # the log is still there when the database is back
                 yield b": the database is away\n\n"
                 await asyncio.sleep(POLL_SECONDS)
@@ -137,9 +214,9 @@ async def _stream(
             except NotFound:
                 return  # purged: whoever asks again is told so
             for event in page:
-                start = event.sequence if environment is not None else event.position
-                if environment is not None or who.may_enter(event.environment):
-                    yield _line(event, start)
+                start = event.number
+                if bearer.who.may_enter(event.environment):  # it may have had another name then
+                    yield event.line
             if page:
                 quiet = 0.0
                 continue

@@ -242,7 +242,7 @@ class Environments(Base):
                 name=name,
                 author=author,
                 time=now,
-                message=f"renamed {row.name} to {new_name}",
+                message="renamed",  # to which name is not for everybody who may see one of them
             )
 
     def delete_environment(self, name: str, author: str = "") -> Environment:

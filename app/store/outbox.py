@@ -8,12 +8,13 @@ from typing import Any, Literal
 
 from sqlalchemy import Connection, func, insert, select, update
 
+from app.errors import NotFound
 from app.store import tables
 from app.store.base import Base, environment_row
 from app.store.values import Event, PartEntry, rfc3339
 
 REACH = 100_000
-"""So far back in the log the last events of environments are looked for."""
+"""So far back in the log the last events of environments, and of names that are gone, are looked for."""
 
 EventType = Literal[
     "version.created",
@@ -93,21 +94,33 @@ def append(
     )
 
 
+def _reach(connection: Connection) -> int:
+    """Before this position the log is not searched without an index."""
+    return int(connection.execute(select(tables.log.c.position).where(tables.log.c.id == 1)).scalar_one()) - REACH
+
+
 class Outbox(Base):
     """Reading the log."""
 
     def events(self, environment: str | None, since: int = 0, limit: int = 1000) -> list[Event]:
-        """Events after ``since``, oldest first: a sequence with an environment, else a position of the whole log."""
+        """Events after ``since``, oldest first: a sequence with an environment, else a position of the whole log.
+
+        Under a name that an environment had (it was renamed, or purged) what was told until then; NotFound where that
+        is nothing.
+        """
         table = tables.event
         with self._database.read() as connection:
             query = select(table)
             if environment is None:
                 query = query.where(table.c.position > since).order_by(table.c.position)
             else:
-                row = environment_row(connection, environment, deleted=True)
-                query = query.where(table.c.environment_id == row.id, table.c.sequence > since).order_by(
-                    table.c.sequence
-                )
+                try:
+                    own = table.c.environment_id == environment_row(connection, environment, deleted=True).id
+                except NotFound:
+                    own = (table.c.environment == environment) & (table.c.position > _reach(connection))
+                    if connection.execute(query.where(own, table.c.sequence > since).limit(1)).first() is None:
+                        raise
+                query = query.where(own, table.c.sequence > since).order_by(table.c.sequence)
             rows = connection.execute(query.limit(limit)).all()
         return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in rows]
 

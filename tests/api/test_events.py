@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from typing import Any
+
+import pytest
 
 from tests.api import samples
 from tests.api.conftest import API, Api
@@ -48,8 +51,79 @@ def test_all_environments_of_a_token(api: Api, fresh: Any) -> None:
     assert api.as_(token).get(f"events?environment={theirs}&follow=false", expect=None).status_code == 403
 
 
+def test_the_end_of_a_name_is_told_under_it(api: Api, fresh: Any) -> None:
+    """Whoever follows an environment that is renamed, or purged, hears of it; of its new name only who may go there."""
+    old, new = fresh(), fresh()
+    api.post("environments", {"name": old})
+    local = api.token_for("viewer", environments=old)
+    following = stream(local, environment=old, since=0)
+    assert next(following)[1] == "environment.created"
+    api("PATCH", f"environments/{old}", 200, json={"name": new})
+    number, kind, body = next(following)
+    assert (number, kind, body["environment"]) == (2, "environment.deleted", old)
+    assert list(following) == [], "and that is the end"
+    assert new not in json.dumps(body)
+    again = list(stream(local, environment=old, headers={"last-event-id": "1"}))
+    assert [body for _, _, body in again] == [body]
+    assert local.get(f"events?environment={old}&since=2", expect=None).status_code == 404
+    everything = stream(local, since=0, follow="false")
+    assert {b["environment"] for _, _, b in everything} == {old}
+    other = api.token_for("viewer", environments=new)
+    assert [(n, b["environment"]) for n, _, b in stream(other, environment=new, since=0, follow="false")] == [(3, new)]
+    api("DELETE", f"environments/{new}", 204)
+    api.post(f"environments/{new}/purge", expect=204)
+    told = list(stream(api, environment=new, since=3, follow="false"))
+    assert [(n, kind) for n, kind, _ in told] == [(4, "environment.deleted")]
+    api.post("environments", {"name": new})
+    told = list(stream(api, environment=new, headers={"last-event-id": "4"}, follow="false"))
+    assert [(n, kind) for n, kind, _ in told] == [(5, "environment.created")]
+
+
+def test_a_stream_ends_with_its_token(api: Api, bare: str) -> None:
+    made = api.post("tokens", {"name": "seer", "role": "viewer"}).json()
+    following = stream(api.as_(made["token"]), environment=bare, since=0)
+    assert next(following)[1] == "environment.created"
+    api("DELETE", f"tokens/{made['id']}", 204)
+    api.upload(bare, samples.grid())
+    assert list(following) == []
+    soon = (datetime.now(UTC) + timedelta(seconds=1)).isoformat()
+    brief = api.post("tokens", {"name": "guest", "role": "viewer", "expires": soon}).json()
+    assert [kind for _, kind, _ in stream(api.as_(brief["token"]), environment=bare, since=1)] == ["version.created"]
+
+
+def test_streams_at_one_place_share_a_look(api: Api, bare: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = type(api.app.state.services.store)
+    looks, quick = [], store.events
+
+    def counted(self: Any, environment: Any, since: int = 0, limit: int = 1000) -> Any:
+        looks.append((environment, since))
+        return quick(self, environment, since, limit)
+
+    count = 30
+    begun, told = threading.Barrier(count + 1), []
+
+    def follow(client: Api) -> None:
+        following = stream(client, environment=bare, since=0)
+        next(following)
+        begun.wait(30)
+        told.append(next(following)[2]["version"])
+
+    threads = [threading.Thread(target=follow, args=(api.as_(api.token),)) for _ in range(count)]
+    for thread in threads:
+        thread.start()
+    begun.wait(30)
+    monkeypatch.setattr(store, "events", counted)
+    api.upload(bare, samples.grid())
+    for thread in threads:
+        thread.join(30)
+    assert told == [1] * count
+    assert looks.count((bare, 1)) < count / 2
+
+
 def test_refusals(api: Api, bare: str) -> None:
     assert api.get("events?environment=nowhere&follow=false", expect=None).status_code == 404
     bad = api.get(f"events?environment={bare}", expect=None, headers={"last-event-id": "x"})
     assert bad.status_code == 422
     assert api.get("events?since=-1", expect=None).status_code == 422
+    for query in (f"environment={bare}&since=2", f"since={10**9}"):
+        assert "nothing with the number" in api.problem("GET", f"events?{query}&follow=false", 422)["detail"]
