@@ -18,7 +18,7 @@ from typing import Any
 from app.agent import hooks, trust
 from app.agent.ear import Ear
 from app.agent.folder import Folder
-from app.agent.state import State, load, save
+from app.agent.state import State, load, save, write_whole
 from app.agent.trust import File, Manifest
 from app.agent.web import Busy, Stopped, Web
 from app.errors import FleetMapError, Invalid, NotFound, Unavailable, Untrusted
@@ -38,8 +38,16 @@ an open router anybody can put events.
 """
 
 MAX_DOUBLINGS = 8
-KEPT_EVENTS = 200
-LAYER = re.compile(r"[a-z][a-z0-9_]{0,31}")
+LAYERS = ("imagery", "location", "objects", "occupancy", "topology", "voxels", "zones")
+"""What may have changed, where the server is too old to tell."""
+
+ROUTER = re.compile(r"(tcp|tls|quic|udp|ws|wss)/[A-Za-z0-9_.:%\[\]-]+")
+"""A router as a server may tell it: no device, no local socket, nothing (``#…``) that would weaken the robot's TLS."""
+
+MAX_VARIABLE_BYTES = 100_000
+
+LONG_SECONDS = 5.0
+"""After a longer download the channel is looked at again before the switch."""
 
 REJOIN_SECONDS = 1.0
 """A fleet that finds its router again does not ask in the same moment: up to so long."""
@@ -108,8 +116,6 @@ class Agent:
         self._web = Web(options.server, options.token, self._stopping, options.ca)
         self._ear: Ear | None = None
         self._state = State(options.environment)
-        self._events: dict[int, messages.Event] = {}
-        self._lock = threading.Lock()
         self._said: RobotStatus | None = None
         self._put: RobotStatus | None = None
         self._put_at = 0.0
@@ -141,6 +147,8 @@ class Agent:
         if installed is not None and name is not None and (bad := self._folder.damaged(name, installed)):
             self._tell("damaged", version=installed.version, files=bad[:20])
             self._state = dataclasses.replace(self._state, etag=None)
+        if installed is not None and name is not None:
+            self._folder.refresh(name, installed)
 
     def close(self) -> None:
         """Let go of everything."""
@@ -153,6 +161,7 @@ class Agent:
         """End soon; may be called from a signal's handler or another thread."""
         self._stopping.set()
         self._wake.set()
+        self._web.interrupt()
 
     def once(self) -> bool:
         """One sync: whether the folder now holds the channel's map and all hooks were content."""
@@ -168,6 +177,7 @@ class Agent:
             self._robot,
             heard=self._heard,
             back=self._back,
+            lost=self._lost,
             config=self.options.zenoh_config,
             login=self._login,
         )
@@ -229,16 +239,12 @@ class Agent:
         return GATHER_SECONDS * 2.0 ** min(MAX_DOUBLINGS, self._in_vain)
 
     def _heard(self, event: messages.Event) -> None:
-        """In a thread of Zenoh's: remember it, wake the loop if it is of our concern."""
+        """In a thread of Zenoh's: wake the loop if it is of our concern."""
         if event.environment != self.options.environment or not isinstance(event.channel, str | None):
             return
         channel = self._state.channel
         if event.sequence <= self._mark:
             return
-        with self._lock:
-            self._events[event.sequence] = event
-            while len(self._events) > KEPT_EVENTS:
-                del self._events[min(self._events)]
         ours = {self.options.channel} if self.options.channel else {PRODUCTION, channel}
         if event.type == "version.created":
             concerns = channel in (LATEST, None)
@@ -262,6 +268,11 @@ class Agent:
         self._put = self._on_bus = None  # who was away may not know how we are
         self._wake.set()
 
+    def _lost(self, problem: str) -> None:
+        self._tell(
+            "polling", detail=f"{problem}; changes are noticed within {self.options.poll_seconds:g} seconds or so"
+        )
+
     def _find_router(self) -> None:
         if self._ear is None:
             return
@@ -273,11 +284,16 @@ class Agent:
                 connect = connect or (str(told) if told else None)
                 prefix = prefix or str(found.get("prefix") or messages.PREFIX)
             except (FleetMapError, AttributeError):
-                if connect is None:
+                if connect is None or self._ear.aimed:
                     return
                 prefix = prefix or messages.PREFIX
         if connect is None:
             self._tell_once("polling", detail="the server tells no router: FLEETMAP_ZENOH_CONNECT can name one")
+            return
+        told = self.options.zenoh_connect is None
+        if told and not all(ROUTER.fullmatch(part.strip()) for part in connect.split(",")):
+            detail = f"the server tells a router by what is no plain address ({connect[:300]}): FLEETMAP_ZENOH_CONNECT"
+            self._tell_once("polling", detail=f"{detail} can name it")
             return
         self._ear.aim(connect, prefix)
 
@@ -303,6 +319,7 @@ class Agent:
     _after = 0.0
 
     def _sync(self) -> bool:
+        self._keep(self._state)
         plans = self._plans()
         channel = self._channel(plans)
         manifest = self._manifest(channel)
@@ -318,15 +335,14 @@ class Agent:
                 self._activated = standing
             if plans is not None:
                 self._preload(planned)
-        with self._lock:
-            mark = self._state.marks.get(channel, (0, ""))[0]
-            self._events = {s: e for s, e in self._events.items() if s > mark}
         return good
 
     def _plans(self) -> list[Mapping[str, Any]] | None:
         try:
             return self._web.channels(self.options.environment)
         except (NotFound, Invalid) as error:
+            if self.options.channel is None and PRODUCTION not in self._state.marks:
+                raise  # which channel to follow is not known then
             self._tell_once("channels", detail=error.detail)
             return None
 
@@ -340,18 +356,22 @@ class Agent:
         self._tell_once("following", channel=LATEST, detail="no channel production stands on a version yet")
         return LATEST
 
-    def _manifest(self, channel: str) -> Manifest | None:
-        """The channel's manifest, believed; None where the installed one is still it."""
+    def _manifest(self, channel: str, wanted: Callable[[Manifest], bool] = lambda _: True) -> Manifest | None:
+        """The channel's manifest, believed; None where the installed one is still it, or it is not wanted."""
         asked = f"{channel}?{','.join(self.options.formats)}"
         state = self._state
         current = state.asked == asked and state.etag is not None and state.expires > self._clock()
-        fits = current and self._folder.standing is not None
+        installed = self._folder.manifest(self._folder.standing)
+        newest = installed is not None and (installed.sequence, installed.root) == state.marks.get(channel)
+        fits = current and newest  # else "not modified" would be said of a map that does not stand
         found = self._web.manifest(
             self.options.environment, channel, self.options.formats, state.etag if fits else None
         )
         if found is None:
             return None
         manifest, key = self._believe(found[0], found[1], channel, state.marks.get(channel))
+        if not wanted(manifest):
+            return None
         new = dataclasses.replace(state, key=key).marked(channel, manifest.sequence, manifest.root)
         if state.key != key:
             self._tell("trusting", key=trust.key_id(key), detail="rotated" if state.key else "first contact")
@@ -386,8 +406,9 @@ class Agent:
             self._target = (manifest.version, manifest.root)
             self._say("downloading")
             sources = self._fetch(manifest, installed)
-            layers = self._layers(installed, manifest)
-            self._keep(dataclasses.replace(self._state, layers=tuple(sorted({*self._state.layers, *layers}))))
+            if (newer := self._overtaken(manifest, time.monotonic() - begun)) is not None:
+                self._install(newer)
+                return
             name = self._folder.build(manifest, sources)
             self._folder.switch(name)
             self._tell(
@@ -407,6 +428,25 @@ class Agent:
         self._keep(dataclasses.replace(self._state, etag=etag, asked=asked, expires=expires))
         self._folder.tidy(self._preloaded[2] if self._preloaded else ())
 
+    def _overtaken(self, manifest: Manifest, seconds: float) -> Manifest | None:
+        """The channel's newer manifest, where it moved on while this map was fetched, to one that is here already: what
+        was taken back meanwhile is not put in place. Where the newer one is still to be fetched it has its turn.
+        """
+        if manifest.channel is None or (self._called <= manifest.sequence and seconds < LONG_SECONDS):
+            return None
+        index = self._folder.index()
+
+        def here(newer: Manifest) -> bool:
+            if newer.sequence == manifest.sequence:
+                return False
+            self._wake.set()
+            return all(self._folder.known(file, index) is not None for file in newer.files)
+
+        try:
+            return self._manifest(manifest.channel, here)
+        except FleetMapError:
+            return None  # the next look tells of it
+
     def _fetch(self, manifest: Manifest, installed: Manifest | None) -> dict[str, Path]:
         index = self._folder.index()
         old = {file.path: file for file in installed.files} if installed else {}
@@ -418,7 +458,7 @@ class Agent:
                 wanted.append(file)
             else:
                 sources[file.path] = there
-        self._folder.demand_room(sum(file.size for file in wanted))
+        self._folder.make_room(manifest, sources, self._preloaded[2] if self._preloaded else ())
         for file in wanted:
             ready = self._folder.ready(file)
             if not ready.exists():  # two names can have the same bytes
@@ -426,32 +466,6 @@ class Agent:
                 self._web.fetch(manifest.environment, manifest.version, file, ready, before)
             sources[file.path] = ready
         return sources
-
-    def _layers(self, old: Manifest | None, new: Manifest) -> list[str]:
-        """The layers that changed: by the events from the old version to the new one, else by asking."""
-        if old is None or not self.options.on_change:
-            return []
-        with self._lock:
-            events = [self._events[s] for s in sorted(self._events)]
-        moved = [
-            e for e in events if e.channel == new.channel or (new.channel == LATEST and e.type == "version.created")
-        ]
-        at, layers = old.root, set()
-        for event in moved:
-            previous = event.body.get("previous")
-            if isinstance(previous, dict) and previous.get("root") == at and event.sequence <= new.sequence:
-                at = event.root
-                parts = event.body.get("layers")
-                parts = parts if isinstance(parts, list) else []
-                layers |= {str(part.get("layer")) for part in parts if isinstance(part, dict)}
-        if at == new.root and all(LAYER.fullmatch(layer) for layer in layers):
-            return sorted(layers)
-        try:
-            told = self._web.changed_layers(new.environment, old.version, new.version)
-            return [layer for layer in told if LAYER.fullmatch(layer)]
-        except FleetMapError as error:
-            self._tell("layers", detail=f"which layers changed is not known: {error.detail}")
-            return []
 
     def _preload(self, planned: Any) -> None:
         """Fetch what a channel is planned to move to, so that the switch itself takes no time."""
@@ -469,6 +483,8 @@ class Agent:
         if found is None:
             return
         manifest, _ = self._believe(found[0], found[1], None, None)
+        if manifest.version != version:
+            raise Untrusted(f"the manifest is of version {manifest.version}, and {version} was asked for")
         self._target = (manifest.version, manifest.root)
         self._fetch(manifest, self._folder.manifest(self._folder.standing))
         self._preloaded = (manifest.version, manifest.root, manifest.files)
@@ -483,6 +499,8 @@ class Agent:
         if name is None or manifest is None or self._state.activated == name:
             return True
         before = self._folder.manifest(self._state.activated)
+        if self.options.on_change:  # cut off in the middle, or taken back: what the robot has taken is not known
+            self._keep(dataclasses.replace(self._state, activated=None))
         variables = {
             "FLEETMAP_ENVIRONMENT": manifest.environment,
             "FLEETMAP_VERSION": str(manifest.version),
@@ -490,28 +508,48 @@ class Agent:
             "FLEETMAP_CHANNEL": manifest.channel or "",
             "FLEETMAP_SEQUENCE": str(manifest.sequence),
             "FLEETMAP_CURRENT": str(self._folder.current),
-            "FLEETMAP_CHANGED": "\n".join(_changed(before, manifest)),
-            "FLEETMAP_LAYERS": " ".join(self._state.layers),
+            **self._changes(_changed(before, manifest)),
+            "FLEETMAP_LAYERS": " ".join(_changed_layers(before, manifest)),
             "FLEETMAP_ROBOT": self._robot,
         }
         for command in self.options.on_change:
-            problem = hooks.run(command, variables)
+            problem = hooks.run(command, variables, stopping=self._stopping)
             if problem is not None:
+                if self._stopping.is_set():
+                    raise Stopped
                 self._fail(
                     "failed", f"version {manifest.version} is in place, but its robot has not taken it: {problem}"
                 )
-                self._keep(dataclasses.replace(self._state, activated=None))  # what it took of it is not known
                 return False
             self._tell("hook", command=command, version=manifest.version)
-        self._keep(dataclasses.replace(self._state, activated=name, layers=()))
+        self._keep(dataclasses.replace(self._state, activated=name))
         return True
+
+    def _changes(self, paths: Sequence[str]) -> dict[str, str]:
+        """The variables that list changed files. A variable's size is limited (128 KiB on Linux): what does not fit is
+        left out from the deepest folders up, and stands in the file with the rest.
+        """
+        where = self._folder.path / "changed"
+        write_whole(where, "".join(f"{path}\n" for path in paths).encode())
+        room, fit = MAX_VARIABLE_BYTES, set()
+        for path in sorted(paths, key=lambda p: (p.count("/"), p)):
+            room -= len(path.encode()) + 1
+            if room < 0:
+                break
+            fit.add(path)
+        return {"FLEETMAP_CHANGED": "\n".join(p for p in paths if p in fit), "FLEETMAP_CHANGED_FILE": str(where)}
 
     # --- what is told ---
 
     def _keep(self, state: State) -> None:
+        """On the disk, too. What could not be written is tried again, before anything else is done."""
         if state != self._state:
-            self._state = state
+            self._state, self._unsaved = state, True
+        if self._unsaved:
             save(self._folder.state, state)
+            self._unsaved = False
+
+    _unsaved = False
 
     def _say(self, state: RobotState, detail: str | None = None) -> None:
         """Note the status and send it. version and root: of what it is about: what stands, unless another
@@ -583,6 +621,14 @@ def _changed(old: Manifest | None, new: Manifest) -> list[str]:
     """Paths of files that are new, gone or other."""
     before, after = old.content if old else {}, new.content
     return sorted(path for path in {*before, *after} if before.get(path) != after.get(path))
+
+
+def _changed_layers(old: Manifest | None, new: Manifest) -> list[str]:
+    """Names of the layers that are new, gone or other."""
+    if not new.layers:
+        return list(LAYERS)
+    before, after = old.layers if old else {}, new.layers
+    return sorted(name for name in {*before, *after} if before.get(name) != after.get(name))
 
 
 def _text(key: bytes) -> str:

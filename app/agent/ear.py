@@ -34,7 +34,8 @@ MAX_EVENT_BYTES = 2**18
 class Ear:
     """A session that is opened as soon as it can be, in a thread of its own. Methods are thread-safe.
 
-    heard: called with each event of the environment. back: called when the router is there (again).
+    heard: called with each event of the environment. back: called when the router is there (again). lost: called with
+    the reason when it is not, once for each reason.
     """
 
     def __init__(
@@ -44,10 +45,11 @@ class Ear:
         *,
         heard: Callable[[messages.Event], None],
         back: Callable[[], None],
+        lost: Callable[[str], None] = lambda _: None,
         config: Path | None = None,
         login: Login | None = None,
     ) -> None:
-        self._environment, self._robot, self._heard, self._back = environment, robot, heard, back
+        self._environment, self._robot, self._heard, self._back, self._lost = environment, robot, heard, back, lost
         self._config, self._login = config, login or Login()
         self._where: tuple[str, str] | None = None
         self._session: zenoh.Session | None = None
@@ -67,6 +69,11 @@ class Ear:
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="fleetmap-ear", daemon=True)
             self._thread.start()
+
+    @property
+    def aimed(self) -> bool:
+        """Whether it knows a router."""
+        return self._where is not None
 
     @property
     def connected(self) -> bool:
@@ -108,6 +115,7 @@ class Ear:
     def _run(self) -> None:
         pause = 1.0
         there = False
+        told: str | None = None
         while not self._stopping.is_set():
             if self._aimed.is_set():
                 self._aimed.clear()
@@ -115,13 +123,19 @@ class Ear:
                 there = False
             if self._session is None:
                 if not self._open():
+                    if self.problem is not None and self.problem != told:
+                        self._lost(self.problem)
+                        told = self.problem
                     self._aimed.wait(pause * random.uniform(0.5, 1.5))  # noqa: S311  jitter is no secret
                     pause = min(MAX_PAUSE_SECONDS, pause * 2)
                     continue
                 pause = 1.0
             now = self.connected
             if now and not there:
+                told = None
                 self._back()
+            elif there and not now:
+                self._lost(f"the router at {self._where[0] if self._where else ''} is gone")
             there = now
             self._aimed.wait(LOOK_SECONDS)
 

@@ -18,11 +18,11 @@ import os
 import shlex
 import shutil
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
-from app.agent.state import sync_folder
+from app.agent.state import sync_folder, write_new
 from app.agent.trust import File, Manifest, parse
 from app.errors import Conflict, Unavailable, Untrusted
 
@@ -72,9 +72,10 @@ class Folder:
     def standing(self) -> str | None:
         """The name of the version that ``current`` points to."""
         try:
-            return Path(self.current.readlink()).name
+            where = self.current.readlink()
         except OSError:
             return None
+        return where.name if where == Path("versions") / where.name else None
 
     def manifest(self, name: str | None) -> Manifest | None:
         """The manifest of a version that is there."""
@@ -106,8 +107,9 @@ class Folder:
     def known(self, file: File, index: Mapping[str, Sequence[Path]]) -> Path | None:
         """A file with these bytes, fetched or of a version that is there; its hash is verified now."""
         fetched = self.ready(file)
-        if fetched.exists():
+        if _holds(fetched, file):
             return fetched
+        fetched.unlink(missing_ok=True)  # damaged while it lay here
         return next((path for path in index.get(file.sha256, ()) if _holds(path, file)), None)
 
     def before(self, file: File, installed: Mapping[str, File]) -> tuple[Path, str] | None:
@@ -119,17 +121,50 @@ class Folder:
         where = self.versions / standing / old.path
         return (where, old.sha256) if _holds(where, old) else None
 
-    def demand_room(self, count: int) -> None:
-        """Unavailable where so many bytes do not fit."""
-        free = shutil.disk_usage(self.path).free
-        if free < count + CHUNK:
+    def make_room(self, manifest: Manifest, sources: Mapping[str, Path], keep: Sequence[File] = ()) -> None:
+        """See that those of a manifest's files fit that are not among ``sources``, less what was fetched of them.
+
+        Where they do not: without parts of other maps, then without old versions, then without what lies ready for a
+        later map (``keep``). Unavailable where that is not enough.
+        """
+        wanted = {file.sha256: file for file in manifest.files if file.path not in sources}.values()
+        count = sum(file.size - min(file.size, self._fetched(file)) for file in wanted) + CHUNK
+        steps: Sequence[Callable[[], None]] = (
+            lambda: self._forget((*manifest.files, *keep)),
+            lambda: self._drop(0, sources.values()),
+            lambda: self._forget(manifest.files),
+        )
+        for step in steps:
+            if self._free() < count:
+                step()
+        if (free := self._free()) < count:
             raise Unavailable(f"the new map needs {count} bytes more and {self.path} has {free} left")
+
+    def _free(self) -> int:
+        return shutil.disk_usage(self.path).free
+
+    def _fetched(self, file: File) -> int:
+        try:
+            return self.ready(file).with_suffix(".part").stat().st_size
+        except OSError:
+            return 0
 
     # --- what changes ---
 
     def describe(self, name: str, manifest: Manifest) -> None:
         """A newer manifest of a version that is there: the same files under a later sequence or expiry."""
         self._describe(self.versions / name, manifest)
+
+    def refresh(self, name: str, manifest: Manifest) -> None:
+        """Write ``environment.sh`` anew where the folder was moved, or an older agent wrote it."""
+        where = self.versions / name / "environment.sh"
+        data = environment_sh(manifest, self.current).encode()
+        try:
+            if where.read_bytes() == data:
+                return
+        except FileNotFoundError:
+            pass
+        write_new(where, data)
 
     def build(self, manifest: Manifest, sources: dict[str, Path]) -> str:
         """A version's folder, whole and on the disk, not yet current: its name. sources: path -> verified file."""
@@ -141,23 +176,34 @@ class Folder:
                 return name
         staging = self.versions / ".new"
         shutil.rmtree(staging, ignore_errors=True)
+        try:
+            self._stage(staging, manifest, sources)
+            name, count = base, 0
+            while (self.versions / name).exists():
+                count += 1
+                name = f"{base}.{count}"
+            staging.rename(self.versions / name)
+        except OSError:
+            shutil.rmtree(staging, ignore_errors=True)  # on a full disk it would only be in the way
+            raise
+        sync_folder(self.versions)
+        return name
+
+    def _stage(self, staging: Path, manifest: Manifest, sources: Mapping[str, Path]) -> None:
         staging.mkdir()
         folders = {staging}
         for file in manifest.files:
             target = staging / file.path
             target.parent.mkdir(parents=True, exist_ok=True)
             folders |= {parent for parent in target.parents if staging in parent.parents}
+            if os.path.lexists(target):
+                raise Conflict(
+                    f"{file.path} and another file of the map have one name on the file system of {self.path}"
+                )
             _link(sources[file.path], target)
         self._describe(staging, manifest)
         for folder in folders:
             sync_folder(folder)
-        name, count = base, 0
-        while (self.versions / name).exists():
-            count += 1
-            name = f"{base}.{count}"
-        staging.rename(self.versions / name)
-        sync_folder(self.versions)
-        return name
 
     def switch(self, name: str) -> None:
         """Make a built version the current one, at once."""
@@ -171,12 +217,20 @@ class Folder:
 
     def tidy(self, keep: Iterable[File] = ()) -> None:
         """Remove versions beyond the kept ones, and fetched files but those to keep."""
-        standing = self.standing
-        others = [n for n in self._names() if n != standing]
-        for name in others[KEPT:]:
+        self._drop(KEPT)
+        self._forget(keep)
+
+    def _drop(self, kept: int, needed: Iterable[Path] = ()) -> None:
+        """Remove versions beside the current one but so many, the last used ones, and those of needed files."""
+        spared = {self.standing} | {p.relative_to(self.versions).parts[0] for p in needed if self.versions in p.parents}
+        for name in [n for n in self._names() if n not in spared][kept:]:
             gone = self.versions / f".{name}"
+            shutil.rmtree(gone, ignore_errors=True)
             (self.versions / name).rename(gone)
             shutil.rmtree(gone, ignore_errors=True)
+
+    def _forget(self, keep: Iterable[File]) -> None:
+        """Remove fetched files, and parts, but those to keep."""
         wanted = {file.sha256 for file in keep}
         for path in self.partial.iterdir():
             if path.name.removesuffix(".part") not in wanted:
@@ -194,12 +248,7 @@ class Folder:
             ("environment.sh", environment_sh(manifest, self.current).encode()),
             ("manifest.json", manifest.data),
         ):
-            temporary = where / f".{name}.new"
-            with temporary.open("wb") as stream:
-                stream.write(data)
-                stream.flush()
-                os.fsync(stream.fileno())
-            temporary.replace(where / name)
+            write_new(where / name, data)
 
 
 def digest(path: Path) -> str:

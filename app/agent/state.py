@@ -22,7 +22,7 @@ FORM = 1
 class State:
     """marks: channel -> (sequence, root) of the newest manifest ever believed. etag, expires (seconds since 1970) and
     asked (channel and formats) are of the manifest that is installed. activated: the folder for which the hooks have
-    run; layers: changed since then.
+    run; None while they do.
     """
 
     environment: str
@@ -34,7 +34,6 @@ class State:
     expires: float = 0.0
     asked: str = ""
     activated: str | None = None
-    layers: tuple[str, ...] = ()
 
     def marked(self, channel: str, sequence: int, root: str) -> State:
         """After a manifest of this channel was believed."""
@@ -57,11 +56,10 @@ def load(path: Path, environment: str) -> State:
             expires=float(body.get("expires", 0)),
             asked=str(body.get("asked", "")),
             activated=body.get("activated"),
-            layers=tuple(str(name) for name in body.get("layers", ())),
         )
     except FileNotFoundError:
         return State(environment)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise Invalid(
             f"{path} cannot be read ({error}). Remove it to start afresh; the key is then pinned anew at first contact"
         ) from None
@@ -83,20 +81,29 @@ def save(path: Path, state: State) -> None:
         "expires": state.expires,
         "asked": state.asked,
         "activated": state.activated,
-        "layers": list(state.layers),
     }
     write_whole(path, json.dumps(body, indent=1).encode() + b"\n")
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Replace a file at once."""
-    temporary = path.with_name(f".{path.name}.new")
-    with temporary.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(path)
+    """Replace a file at once, and for good."""
+    write_new(path, data)
     sync_folder(path.parent)
+
+
+def write_new(path: Path, data: bytes) -> None:
+    """Replace a file at once. No link that somebody has put beside it is followed, and no full disk left fuller."""
+    temporary = path.with_name(f".{path.name}.new")
+    temporary.unlink(missing_ok=True)
+    try:
+        with temporary.open("xb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def sync_folder(path: Path) -> None:

@@ -29,6 +29,7 @@ MAX_FILES = 100_000
 MAX_VARIABLES = 2000
 _HASH = re.compile(r"[0-9a-f]{64}")
 _FORMAT = re.compile(r"[a-z0-9][a-z0-9_]{0,62}")
+_LAYER = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _KEY_ID = re.compile(r"[0-9a-f]{16}")
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
 _FORBIDDEN = re.compile(
@@ -56,7 +57,8 @@ class File:
 class Manifest:
     """A signed list of a version's files. data, signature: the signed bytes and the header, as they came.
 
-    variables: what the place is called (``FARM_NAME`` …), for who sources ``environment.sh``.
+    variables: what the place is called (``FARM_NAME`` …), for who sources ``environment.sh``. layers: layer -> a hash
+    of its content.
     """
 
     environment: str
@@ -69,6 +71,7 @@ class Manifest:
     data: bytes
     signature: str
     variables: Mapping[str, str] = field(default_factory=dict)
+    layers: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def content(self) -> dict[str, str]:
@@ -93,6 +96,7 @@ def parse(data: bytes, signature: str) -> Manifest:
             data,
             signature,
             dict(body.get("variables", {})),
+            dict(body.get("layers", {})),
         )
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise Untrusted(f"the server's manifest cannot be read: {type(error).__name__}: {error}") from None
@@ -103,6 +107,8 @@ def parse(data: bytes, signature: str) -> Manifest:
         raise Untrusted("the server's manifest cannot be read: a number, a hash or the time of expiry is none")
     _check_paths(files)
     _check_variables(found.variables)
+    if not all(isinstance(t, str) for t in found.layers.values()) or not all(map(_LAYER.fullmatch, found.layers)):
+        raise Untrusted("the server's manifest cannot be read: a layer's name or hash is none")
     return found
 
 
@@ -215,7 +221,7 @@ def check(
         raise Untrusted(f"the manifest is of the environment {manifest.environment!r}, not of {environment!r}")
     if manifest.channel != channel:
         raise Untrusted(f"the manifest is of the channel {manifest.channel!r}, not of {channel!r}")
-    if manifest.expires + CLOCKS_DIFFER < (now or datetime.now(UTC)):
+    if manifest.expires < (now or datetime.now(UTC)) - CLOCKS_DIFFER:
         raise Untrusted(
             f"the manifest has expired at {manifest.expires:%Y-%m-%d %H:%M:%S} UTC: somebody hands out an old one, or "
             "a clock is wrong"

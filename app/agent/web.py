@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import json
 import os
+import socket
 import sys
 import threading
+import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urljoin
@@ -30,16 +32,30 @@ SIGNATURE = "fleetmap-signature"
 TIMEOUT = httpx.Timeout(10.0, read=60.0)
 """Seconds. A map that takes its server longer is answered with a job."""
 
+HEAD_SECONDS = 90.0
+"""Until an answer has begun: whoever sends its head byte by byte keeps nobody waiting."""
+
+WHOLE_SECONDS = 300.0
+"""Until a manifest or another small answer has come."""
+
+PACE_SECONDS, PACE_BYTES = 60.0, 4096
+"""A file's bytes come at least so fast, else its server is as good as away. What came is gone on from."""
+
 MAX_MANIFEST_BYTES = 32 * 2**20
 MAX_JSON_BYTES = 4 * 2**20
 MAX_DICTIONARY_BYTES = 64 * 2**20
 """A larger file is fetched whole: it would be held in memory twice."""
+
+MIN_DICTIONARY_BYTES = 8
+"""Zstandard takes no shorter one."""
 
 WINDOW_LOG = 27
 """The largest window that a delta may ask for: 128 MiB."""
 
 DCZ_MAGIC = bytes.fromhex("5e2a4d1820000000")
 JOB_SECONDS = 600.0
+MAX_JOBS = 1000
+"""One for each map of a manifest, and then the server loses what it makes."""
 
 
 class Stopped(Exception):
@@ -73,12 +89,19 @@ class Web:
             verify=True if ca is None else trusting(ca),
         )
         self._stopping = stopping
+        self._sockets: list[socket.socket] = []
         self.received = 0
         self.deltas = 0
 
     def close(self) -> None:
         """Let go of the connections."""
         self._http.close()
+
+    def interrupt(self) -> None:
+        """Whoever waits for an answer waits no longer. From any thread, or a signal's handler."""
+        for connection in self._sockets:
+            with contextlib.suppress(OSError):
+                socket.socket.shutdown(connection, socket.SHUT_RDWR)
 
     # --- what is asked ---
 
@@ -96,13 +119,6 @@ class Web:
         found = self._json(f"{API}/environments/{quote(environment, safe='')}/channels?robots=false")
         return [line for line in found if isinstance(line, dict)] if isinstance(found, list) else []
 
-    def changed_layers(self, environment: str, old: int, new: int) -> list[str]:
-        """The layers that differ between two versions."""
-        path = f"{API}/environments/{quote(environment, safe='')}/diff?from={old}&to={new}"
-        found = self._json(path)
-        layers = found.get("layers", {}) if isinstance(found, dict) else {}
-        return sorted(str(name) for name, change in layers.items() if change)
-
     def manifest(
         self, environment: str, ref: str, formats: Iterable[str], etag: str | None = None
     ) -> tuple[bytes, str, str | None] | None:
@@ -112,7 +128,7 @@ class Web:
             f"{API}/environments/{quote(environment, safe='')}/versions/{quote(ref, safe='')}/manifest?formats={asked}"
         )
         headers = {"If-None-Match": etag} if etag else {}
-        while True:
+        for _ in range(MAX_JOBS):
             with self._stream(path, headers) as answer:
                 if answer.status_code == 304 and etag:
                     return None
@@ -122,15 +138,15 @@ class Web:
                 if answer.status_code != 202:
                     raise self._refused(answer)
                 where = answer.headers.get("location", "")
-            self._wait(urljoin(path, where))
+            self._wait(path, where)
+        raise Unavailable(f"{self.server} makes the maps again and again, and does not hand them out")
 
     def put_status(self, robot: str, body: Mapping[str, Any]) -> None:
-        """Tell the robot's status."""
-        with self._reach():
-            path = f"{API}/robots/{quote(robot, safe='')}/status"
-            answer = self._http.put(path, json=dict(body), headers={"Prefer": "return=minimal"})
-        if answer.status_code >= 300:
-            raise self._refused(answer)
+        """Tell the robot's status. What is answered is not read, but where the server does not take it."""
+        path = f"{API}/robots/{quote(robot, safe='')}/status"
+        with self._stream(path, {"Prefer": "return=minimal"}, dict(body)) as answer:
+            if answer.status_code >= 300:
+                raise self._refused(answer)
 
     def fetch(self, environment: str, version: int, file: File, target: Path, old: tuple[Path, str] | None) -> None:
         """A file into ``target``, whole and verified. What a break leaves in ``<target>.part`` is gone on from.
@@ -164,7 +180,7 @@ class Web:
         if start == file.size and start:
             return False
         headers = {"Range": f"bytes={start}-"} if start else {}
-        if old is not None and not start and max(old[0].stat().st_size, file.size) <= MAX_DICTIONARY_BYTES:
+        if old is not None and not start and _fits(old[0].stat().st_size, file.size):
             dictionary = base64.b64encode(bytes.fromhex(old[1])).decode()
             headers |= {"Available-Dictionary": f":{dictionary}:", "Accept-Encoding": "dcz"}
         with self._stream(path, headers) as answer:
@@ -176,7 +192,7 @@ class Web:
                 raise self._refused(answer)
             coding = answer.headers.get("content-encoding", "identity").lower()
             chunks = self._chunks(answer)
-            if coding == "dcz" and old is not None:
+            if coding == "dcz" and "Available-Dictionary" in headers and old is not None:
                 self._write(part, "wb", 0, _undo(chunks, old, file), file, keep=False)
                 self.deltas += 1
                 return False
@@ -189,6 +205,8 @@ class Web:
     @staticmethod
     def _write(part: Path, mode: str, start: int, chunks: Iterable[bytes], file: File, *, keep: bool) -> None:
         written = start
+        if not start:
+            part.unlink(missing_ok=True)  # a link that somebody has put here is not followed
         try:
             with part.open(mode) as stream:
                 for chunk in chunks:
@@ -198,24 +216,33 @@ class Web:
                     stream.write(chunk)
                 stream.flush()
                 os.fsync(stream.fileno())
-        except BaseException:
-            if not keep:
+        except BaseException as error:
+            if not keep or isinstance(error, OSError):  # on a full disk it would only be in the way
                 part.unlink(missing_ok=True)
             raise
         if written > file.size:
             part.unlink(missing_ok=True)
 
     def _chunks(self, answer: httpx.Response) -> Iterator[bytes]:
-        for chunk in answer.iter_raw(1 << 16):
+        """What came, as it came: larger pieces would be lost where the line breaks before they are full."""
+        begun, since = time.monotonic(), 0
+        for chunk in answer.iter_raw():
             if self._stopping.is_set():
                 raise Stopped
             self.received += len(chunk)
+            since += len(chunk)
+            if time.monotonic() - begun > PACE_SECONDS:
+                if since < PACE_BYTES:
+                    raise Unavailable(f"{self.server} has sent {since} bytes in {PACE_SECONDS:g} seconds")
+                begun, since = time.monotonic(), 0
             yield chunk
 
     def _whole(self, answer: httpx.Response, limit: int) -> bytes:
-        data = bytearray()
+        data, end = bytearray(), time.monotonic() + WHOLE_SECONDS
         for chunk in self._chunks(answer):
             data += chunk
+            if time.monotonic() > end:
+                raise Unavailable(f"{self.server} has not answered within {WHOLE_SECONDS:g} seconds")
             if len(data) > limit:
                 raise Untrusted(f"the answer has more than {limit} bytes")
         return bytes(data)
@@ -230,9 +257,13 @@ class Web:
         except (ValueError, RecursionError):
             raise Unavailable(f"{self.server} does not answer as a Fleet Map Server: its answer is no JSON") from None
 
-    def _wait(self, where: str) -> None:
-        """Until a job is done; its problem where it fails."""
-        if not where.startswith("/"):
+    def _wait(self, path: str, location: str) -> None:
+        """Until the job is done to which ``path`` was answered; its problem where it fails."""
+        try:
+            where = urljoin(path, location)
+        except ValueError:
+            where = ""
+        if not where.startswith("/") or where.startswith("//"):
             raise Unavailable(f"{self.server} names a job that is not its own")
         pause, waited = 0.3, 0.0
         while True:
@@ -251,30 +282,53 @@ class Web:
             waited += pause
             pause = min(5.0, pause * 1.5)
 
-    @contextmanager
-    def _stream(self, path: str, headers: Mapping[str, str]) -> Iterator[httpx.Response]:
-        with self._reach(), self._http.stream("GET", path, headers=dict(headers)) as answer:
-            yield answer
+    @contextlib.contextmanager
+    def _stream(self, path: str, headers: Mapping[str, str], body: Any = None) -> Iterator[httpx.Response]:
+        """GET, or PUT where there is a JSON body."""
+        method = "GET" if body is None else "PUT"
+        request = self._http.build_request(
+            method, path, headers=dict(headers), json=body, extensions={"trace": self._note}
+        )
+        with self._reach():
+            late = threading.Timer(HEAD_SECONDS, self.interrupt)
+            late.daemon = True
+            late.start()
+            try:
+                answer = self._http.send(request, stream=True)
+            finally:
+                late.cancel()
+            with contextlib.closing(answer):
+                yield answer
 
-    @contextmanager
+    def _note(self, event: str, told: Mapping[str, Any]) -> None:
+        """Remember the connections, to be able to interrupt them."""
+        if event in ("connection.connect_tcp.complete", "connection.start_tls.complete"):
+            made = told["return_value"].get_extra_info("socket")
+            if isinstance(made, socket.socket):
+                self._sockets = [*(s for s in self._sockets if s.fileno() != -1), made]
+
+    @contextlib.contextmanager
     def _reach(self) -> Iterator[None]:
         if self._stopping.is_set():
             raise Stopped
         try:
             yield
-        except (httpx.TransportError, httpx.InvalidURL) as error:
+        except (httpx.HTTPError, httpx.InvalidURL) as error:
+            if self._stopping.is_set():
+                raise Stopped from None
             raise Unavailable(f"no answer from {self.server}: {error or type(error).__name__}") from None
 
     def _refused(self, answer: httpx.Response) -> FleetMapError:
         """The server's problem as an error of ours."""
         status, detail = answer.status_code, ""
         try:
-            data = answer.content if answer.is_closed else self._whole(answer, MAX_JSON_BYTES)
-            problem = json.loads(data)
+            problem = json.loads(self._whole(answer, MAX_JSON_BYTES))
             detail = str(problem.get("detail") or problem.get("title") or "") if isinstance(problem, dict) else ""
         except (ValueError, RecursionError, httpx.HTTPError, FleetMapError):
             detail = ""
         detail = detail[:1000] or f"{self.server} answered {status}"
+        if 300 <= status < 400 and (elsewhere := answer.headers.get("location")):
+            detail = f"{self.server} sends to {elsewhere[:300]}: if the server has moved, name it so with --server"
         if status in (429, 503):
             try:
                 seconds = float(answer.headers.get("retry-after", "0"))
@@ -296,6 +350,11 @@ def _complete(part: Path, file: File) -> bool:
             return hashlib.file_digest(stream, "sha256").hexdigest() == file.sha256
     except FileNotFoundError:
         return False
+
+
+def _fits(old: int, new: int) -> bool:
+    """Whether a file of so many bytes is asked for as the difference to one of so many."""
+    return old >= MIN_DICTIONARY_BYTES and max(old, new) <= MAX_DICTIONARY_BYTES
 
 
 def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: File) -> Iterator[bytes]:

@@ -775,6 +775,7 @@ class ManifestOut(BaseModel):
     root: str
     expires: datetime
     files: list[ManifestFile]
+    layers: dict[str, str] = Field(description="A hash of each layer: equal where the layer is, in any two versions.")
     variables: dict[str, str] | None = Field(
         None, description="What the place is called: literal variables of an environment_template's scripts."
     )

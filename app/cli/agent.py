@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -96,6 +97,10 @@ def agent(
         raise Invalid("--formats needs one format or several, separated by commas: occupancy_grid,tmap2")
 
     def tell(what: str, **members: Any) -> None:
+        with contextlib.suppress(OSError):  # a log on a full disk, or nobody who reads: the map is kept all the same
+            print_line(what, members)
+
+    def print_line(what: str, members: dict[str, Any]) -> None:
         if as_json:
             time = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
             sys.stdout.write(json.dumps({"time": time, "event": what, **members}, ensure_ascii=False) + "\n")
@@ -147,8 +152,9 @@ def agent(
         agent.close()
     if not once:
         # A thread of Zenoh's that still calls back while the interpreter comes down would abort it.
-        sys.stdout.flush()
-        sys.stderr.flush()
+        with contextlib.suppress(OSError):
+            sys.stdout.flush()
+            sys.stderr.flush()
         os._exit(0)
 
 

@@ -65,6 +65,26 @@ def test_it_says_what_the_place_is_called(api: Api, farm: str) -> None:
     assert manifest(api, farm, "latest", "tmap2")["variables"] == {"FARM_NAME": "north farm", "FIELD_ID": "p1"}
 
 
+def test_layers_differ_where_their_content_does(api: Api, farm: str) -> None:
+    def layers(version: str = "latest") -> dict[str, str]:
+        told: dict[str, str] = manifest(api, farm, version, "tmap2")["layers"]
+        return told
+
+    def changed(before: dict[str, str]) -> set[str]:
+        now = layers()
+        return {name for name in {*before, *now} if before.get(name) != now.get(name)}
+
+    first = layers()
+    assert {"location", "occupancy", "topology"} <= set(first)
+    api.upload(farm, samples.grid(), grid="keepout")
+    assert changed(first) == {"occupancy"}
+    second = layers()
+    api("PATCH", f"environments/{farm}", 200, json={"datum": {"latitude": 53.2, "longitude": -0.5}})
+    assert changed(second) == {"location"}, "all that is anchored on earth lies elsewhere now"
+    api.post(f"environments/{farm}/versions", {"revert_to": 3})
+    assert layers() == first == layers("3")
+
+
 def test_the_sequence_is_that_of_the_channels_move(api: Api, farm: str) -> None:
     sequences = [manifest(api, farm, v, "tmap2")["sequence"] for v in ("2", "latest")]
     assert sequences == [3, 4]

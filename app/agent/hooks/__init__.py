@@ -6,12 +6,17 @@ import contextlib
 import os
 import signal
 import subprocess
-import tempfile
+import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import IO
 
 HERE = Path(__file__).resolve().parent
 HOOK_SECONDS = 300.0
+LOOK_SECONDS = 0.5
+"""Between two looks whether the agent is to end."""
+
 TOLD = 1500
 """Characters of what a failing hook printed that are told."""
 
@@ -21,33 +26,53 @@ def ready_made() -> dict[str, Path]:
     return {path.stem: path for path in sorted(HERE.glob("*.sh"))}
 
 
-def run(command: str, variables: Mapping[str, str], seconds: float = HOOK_SECONDS) -> str | None:
-    """Run a hook to its end: None, or what went wrong. A name of a ready-made one runs that; all else is shell."""
+def run(
+    command: str, variables: Mapping[str, str], seconds: float = HOOK_SECONDS, stopping: threading.Event | None = None
+) -> str | None:
+    """Run a hook to its end: None, or what went wrong. A name of a ready-made one runs that; all else is shell.
+
+    It is ended, with all that it started, after so many seconds, or where ``stopping`` is set meanwhile. What it leaves
+    running in the background is left alone, and read from as long as it prints.
+    """
     script = ready_made().get(command)
     arguments = ["/bin/sh", str(script)] if script else ["/bin/sh", "-c", command]
-    with tempfile.TemporaryFile() as output:
-        try:
-            process = subprocess.Popen(  # noqa: S603  the operator of the robot names the command
-                arguments,
-                env={**os.environ, **variables},
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
-        except OSError as error:
-            return f"--on-change {command}: {error.strerror}"
-        try:
-            status: int | None = process.wait(seconds)
-        except subprocess.TimeoutExpired:
-            status = None
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(process.pid, signal.SIGKILL)  # with all that it started
-            process.wait()
-        if status == 0:
-            return None
-        size = output.seek(0, os.SEEK_END)
-        output.seek(max(0, size - TOLD))
-        said = " ".join(output.read().decode(errors="replace").split())
-    how = f"took more than {seconds:g} seconds" if status is None else f"ended with {status}"
-    return f"--on-change {command} {how}: {said}" if said else f"--on-change {command} {how}"
+    try:
+        process = subprocess.Popen(  # noqa: S603  the operator of the robot names the command
+            arguments,
+            env={**os.environ, **variables},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    except OSError as error:
+        return f"--on-change {command}: {error.strerror}"
+    said = bytearray()
+    reader = threading.Thread(target=_read, args=(process.stdout, said), name="fleetmap-hook", daemon=True)
+    reader.start()
+    end = time.monotonic() + seconds
+    status: int | None = None
+    while status is None and time.monotonic() < end and not (stopping is not None and stopping.is_set()):
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            status = process.wait(min(LOOK_SECONDS, max(0.0, end - time.monotonic())))
+    if status is None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)  # with all that it started
+        process.wait()
+    if status == 0:
+        return None
+    reader.join(LOOK_SECONDS)
+    text = " ".join(bytes(said[-TOLD:]).decode(errors="replace").split())
+    if status is not None:
+        how = f"ended with {status}"
+    else:
+        how = f"took more than {seconds:g} seconds" if time.monotonic() >= end else "was ended with the agent"
+    return f"--on-change {command} {how}: {text}" if text else f"--on-change {command} {how}"
+
+
+def _read(stream: IO[bytes], said: bytearray) -> None:
+    """Keep the end of what is printed: a hook that prints without end fills neither disk nor memory."""
+    with stream:
+        while chunk := os.read(stream.fileno(), 1 << 16):
+            said += chunk
+            del said[:-TOLD]

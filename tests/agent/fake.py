@@ -1,0 +1,171 @@
+"""A server of one environment that signs what it is told to, and does what no server should; an agent of it."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import hashlib
+import json
+import threading
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime, timedelta
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+from app.agent.core import Agent, Options
+from app.signing import Keys
+
+PLACE = "field"
+Files = Mapping[str, bytes]
+"""``<format>/<name>`` -> bytes."""
+
+
+class Fake:
+    """A server. ``put`` adds a version and moves ``latest`` there, ``move`` moves a channel; ``asked`` is what was.
+
+    instead: called with each request first; it answers by itself and returns True where it likes to.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.keys = Keys(folder)
+        self.versions: list[Files] = []
+        self.channels: dict[str, tuple[int, int]] = {}
+        self.sequence = 0
+        self.more: dict[str, Any] = {}
+        self.ready: dict[str, Any] = {}
+        self.planned: dict[str, Any] = {}
+        self.statuses: list[dict[str, Any]] = []
+        self.asked: list[str] = []
+        self.instead: Callable[[BaseHTTPRequestHandler], bool] = lambda _: False
+        fake = self
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+            wbufsize = -1
+
+            def do_GET(self) -> None:
+                fake.asked.append(self.path)
+                with contextlib.suppress(OSError):
+                    if not fake.instead(self):
+                        fake.answer(self)
+
+            def do_PUT(self) -> None:
+                fake.statuses.append(json.loads(self.rfile.read(int(self.headers["content-length"]))))
+                with contextlib.suppress(OSError):
+                    if not fake.instead(self):
+                        send(self, 204, b"")
+
+            def log_message(self, *_: Any) -> None:
+                pass
+
+        class Server(ThreadingHTTPServer):
+            daemon_threads = True
+
+        self._server = Server(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self._server.server_port}"
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join(10)
+
+    def put(self, files: Files) -> int:
+        """A version with these files; its number."""
+        self.versions.append(dict(files))
+        self.move("latest", len(self.versions))
+        return len(self.versions)
+
+    def move(self, channel: str, version: int) -> None:
+        self.sequence += 1
+        self.channels[channel] = (version, self.sequence)
+
+    def manifest(self, ref: str) -> bytes:
+        number, sequence = (int(ref), 1) if ref.isdigit() else self.channels[ref]
+        files = self.versions[number - 1]
+        body = {
+            "environment": PLACE,
+            **({} if ref.isdigit() else {"channel": ref}),
+            "sequence": sequence,
+            "version": number,
+            "root": hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest(),
+            "expires": (datetime.now(UTC) + timedelta(days=1)).isoformat(),
+            "files": [
+                {
+                    "format": path.partition("/")[0],
+                    "name": path.partition("/")[2],
+                    "size": len(data),
+                    "sha256": hashlib.sha256(data).hexdigest(),
+                }
+                for path, data in sorted(files.items())
+            ],
+            "layers": {"topology": hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:16]},
+        }
+        return json.dumps(body | self.more).encode()
+
+    def answer(self, handler: BaseHTTPRequestHandler) -> None:
+        """As a server does."""
+        path = handler.path.partition("?")[0].split("/")
+        if path[-1] == "readyz":
+            return send(handler, 200, json.dumps({"events": self.ready}).encode())
+        if path[-1] == "keys":
+            return send(handler, 200, json.dumps([key.as_dict() for key in self.keys.public()]).encode())
+        if path[-1] == "channels":
+            lines = [
+                {"channel": c, "version": v, "planned": self.planned.get(c)} for c, (v, _) in self.channels.items()
+            ]
+            return send(handler, 200, json.dumps(lines).encode())
+        if path[-1] == "manifest":
+            if not path[-2].isdigit() and path[-2] not in self.channels:
+                return send(handler, 404, b'{"detail": "no such channel"}')
+            data = self.manifest(path[-2])
+            etag = f'"{hashlib.sha256(data.partition(b"expires")[0]).hexdigest()}"'
+            if handler.headers.get("if-none-match") == etag:
+                return send(handler, 304, b"", etag=etag)
+            key, signature = self.keys.sign(data)
+            signed = f"{key}:{base64.b64encode(signature).decode()}"
+            return send(handler, 200, data, etag=etag, **{"fleetmap-signature": signed})
+        data = self.versions[int(path[6]) - 1]["/".join(path[8:])]
+        start = int((handler.headers.get("range") or "bytes=0-")[6:-1])
+        return send(handler, 206 if start else 200, data[start:])
+
+
+def send(handler: BaseHTTPRequestHandler, status: int, body: bytes, **headers: str) -> None:
+    handler.send_response(status)
+    if status not in (204, 304):
+        handler.send_header("content-length", str(len(body)))
+    for name, value in headers.items():
+        handler.send_header(name, value)
+    handler.end_headers()
+    handler.wfile.write(body)
+
+
+class One:
+    """An agent in this process: ``lines`` is what it told."""
+
+    def __init__(
+        self, fake: Fake, into: Path, *on_change: str, formats: tuple[str, ...] = ("kml",), **more: Any
+    ) -> None:
+        self.into = into
+        self.lines: list[dict[str, Any]] = []
+        options = Options(fake.url, PLACE, formats, into, robot="robot", on_change=on_change, **more)
+        self.agent = Agent(options, lambda what, **members: self.lines.append({"event": what, **members}))
+
+    def once(self) -> bool:
+        """Take the folder, sync once, let go."""
+        try:
+            self.agent.open()
+            return self.agent.once()
+        finally:
+            self.agent.close()
+
+    def saw(self, event: str, **members: Any) -> dict[str, Any] | None:
+        fits = (x for x in self.lines if x["event"] == event and all(x.get(k) == v for k, v in members.items()))
+        return next(fits, None)
+
+    @property
+    def detail(self) -> str:
+        """What went wrong last."""
+        return str([x for x in self.lines if x["event"] in ("failed", "refused")][-1]["detail"])
