@@ -22,8 +22,8 @@ from typing import Any
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-KEPT = 3
-"""Keys of which the public part is still told."""
+KEPT = 32
+"""Keys of which the public part is still told: a robot that was away for as many rotations follows."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,6 +92,13 @@ def test_hooks_are_part_of_the_package() -> None:
     assert {p.name for p in (ROOT / "app" / "agent" / "hooks").glob("*.sh")} == {"nav2.sh", "topological.sh"}
 
 
+def test_the_unit_keeps_the_maps_where_the_robot_can_read_them() -> None:
+    unit = (ROOT / "docker" / "fleetmap-agent.service").read_text()
+    assert "\nStateDirectoryMode=0755\n" in unit
+    assert "\nUser=" in unit
+    assert "\nDynamicUser=" not in unit, "its state is below /var/lib/private, which nobody else may enter"
+
+
 def test_router_addresses_are_told_for_who_asks() -> None:
     from app.api.health import router_for
 
