@@ -1,11 +1,14 @@
-"""Fixtures for all tests: the shared real data and its independent readers, beside the checkout."""
+"""For all tests: the real data beside the checkout with its independent readers, and what their processes share."""
 
 from __future__ import annotations
 
 import importlib
 import json
 import os
+import shutil
+import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -13,9 +16,36 @@ from typing import Any
 
 import pytest
 
+from app.derive import _native
 from tests.postgres import postgres_cluster, postgres_url  # noqa: F401  fixtures
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+TOP = Path(__file__).resolve().parents[1]
+COMPILE = """
+import importlib
+from app.derive import _native
+for name in _native._modules():
+    importlib.import_module(name).compile_all()
+"""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """What a process compiles serves the next one: tests start hundreds of them, each of which imports the server.
+
+    Bytecode: where the environment forbids to keep it, a folder of this run takes it. Native code: servers take the
+    user's folder, as the tests' own processes do, not one in each data folder.
+    """
+    if hasattr(config, "workerinput"):  # of pytest-xdist: it has the environment of the process that started it
+        return
+    if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and "PYTHONPYCACHEPREFIX" not in os.environ:
+        folder = tempfile.mkdtemp(prefix="fleetmap-bytecode-")
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+        os.environ["PYTHONPYCACHEPREFIX"] = folder
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(_native.folder().parent))
+    if config.getoption("numprocesses", None):  # many tests: workers of servers may not write what they compile
+        process = subprocess.Popen([sys.executable, "-c", COMPILE], cwd=TOP)
+        config.add_cleanup(process.wait)
+        config.add_cleanup(process.kill)
 
 
 @pytest.fixture(scope="session")
