@@ -22,19 +22,24 @@ class Authority:
         self._name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
         self.pem = self._write(name, self._name, self._key, None)
 
-    def sign(self, name: str) -> tuple[Path, Path]:
-        """A certificate for this machine and its key: the two files."""
+    def sign(self, name: str, days: int = 2) -> tuple[Path, Path]:
+        """A certificate for this machine and its key: the two files. days: how long it is still good."""
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
         here = [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
-        certificate = self._write(name, subject, key, x509.SubjectAlternativeName(here))
+        certificate = self._write(name, subject, key, x509.SubjectAlternativeName(here), days)
         path = self.folder / f"{name}.key"
         plain = serialization.NoEncryption()
         path.write_bytes(key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, plain))
         return certificate, path
 
     def _write(
-        self, name: str, subject: x509.Name, key: ec.EllipticCurvePrivateKey, places: x509.SubjectAlternativeName | None
+        self,
+        name: str,
+        subject: x509.Name,
+        key: ec.EllipticCurvePrivateKey,
+        places: x509.SubjectAlternativeName | None,
+        days: int = 2,
     ) -> Path:
         now = datetime.now(UTC)
         made = (
@@ -43,8 +48,8 @@ class Authority:
             .issuer_name(self._name)
             .public_key(key.public_key())
             .serial_number(x509.random_serial_number())
-            .not_valid_before(now - timedelta(days=1))
-            .not_valid_after(now + timedelta(days=2))
+            .not_valid_before(now - timedelta(days=9))
+            .not_valid_after(now + timedelta(days=days))
             .add_extension(x509.BasicConstraints(ca=places is None, path_length=None), critical=True)
             .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
             .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False)

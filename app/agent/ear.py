@@ -18,7 +18,7 @@ from zenoh import ext
 
 from app.errors import FleetMapError
 from app.events import messages
-from app.events.login import Login
+from app.events.login import Login, no_router
 
 LOOK_SECONDS = 0.5
 """Between two looks whether the router is there."""
@@ -145,8 +145,7 @@ class Ear:
         try:
             session = zenoh.open(configuration(connect, self._config, self._login))
         except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
-            lines = str(error).splitlines()
-            self.problem = f"no router at {connect}: {lines[0][:300] if lines else error!r}"
+            self.problem = no_router(connect, error, self._login)
             return False
         try:
             held = [

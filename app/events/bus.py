@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import re
 import threading
 import time
 from collections import OrderedDict
@@ -25,6 +24,7 @@ from zenoh import ext
 
 from app.errors import Invalid, Problem, Unavailable
 from app.events import messages
+from app.events.login import no_router, plain
 from app.events.router import Router
 from app.events.security import Security
 
@@ -124,6 +124,12 @@ def session_configuration(options: BusOptions) -> str:
     return str(config)
 
 
+def no_connection(options: BusOptions, error: Exception) -> str:
+    """Why the server's own session found no router."""
+    where = options.connect if options.mode == "client" else reachable(options.listen)
+    return no_router(where, error, options.security.login, names=options.mode == "client")
+
+
 def check(options: BusOptions) -> None:
     """Whether what an operator has set up can be used, told before anything starts. Raises FleetMapError."""
     if options.mode == "router":
@@ -210,7 +216,7 @@ class Bus:
                 self._session = zenoh.open(zenoh.Config.from_json5(session_configuration(self.options)))
                 self._declare(self._session)
             except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
-                self._problem = f"no router at {self.where}: {plain(str(error))}"
+                self._problem = no_connection(self.options, error)
                 self._close_session()
                 return False
             self.opened += 1
@@ -353,11 +359,6 @@ class Bus:
     def _refuse(self, query: zenoh.Query, error: Exception) -> None:
         with contextlib.suppress(zenoh.ZError):
             query.reply_err(self._explain(error), encoding="application/problem+json")
-
-
-def plain(said: str) -> str:
-    """The first line of what Zenoh says, without the places in its source."""
-    return re.sub(r",? at /\S+", "", said.splitlines()[0] if said else "")[:300]
 
 
 def _end(held: Any) -> None:

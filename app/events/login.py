@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
+import socket
 import ssl
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from app.errors import Invalid
+
+PROBE_SECONDS = 2.0
+"""How long TLS is tried where Zenoh did not get through."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,11 +31,13 @@ class Login:
         out: dict[str, Any] = {}
         if self.ca is not None:
             out["transport/link/tls/root_ca_certificate"] = file_of(self.ca)
+            trusting(self.ca)
         if (self.certificate is None) != (self.key is None):
             raise Invalid("a certificate for Zenoh needs its key, and the other way round")
         if self.certificate is not None and self.key is not None:
             out["transport/link/tls/connect_certificate"] = file_of(self.certificate)
             out["transport/link/tls/connect_private_key"] = file_of(self.key)
+            _show(ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), self.certificate, self.key)
             out["transport/link/tls/enable_mtls"] = True
         if (self.user is None) != (self.password is None):
             raise Invalid("a user of Zenoh needs a password, and the other way round")
@@ -54,3 +61,47 @@ def trusting(ca: Path) -> ssl.SSLContext:
         return ssl.create_default_context(cafile=ca)
     except (OSError, ssl.SSLError) as error:
         raise Invalid(f"{ca} holds no certificate of a certification authority (PEM): {error}") from error
+
+
+def _show(context: ssl.SSLContext, certificate: Path, key: Path) -> None:
+    """Have a certificate that is shown to who asks. Invalid where it and its key are none."""
+    try:
+        context.load_cert_chain(certificate, key, password="")  # never ask a terminal
+    except (OSError, ssl.SSLError) as error:
+        raise Invalid(f"{certificate} and {key} are no certificate and its unencrypted key (PEM): {error}") from error
+
+
+def no_router(where: str, error: Exception, login: Login, *, names: bool = True) -> str:
+    """Why nobody was reached at ``where``: what TLS has against it, of which Zenoh does not tell, else what Zenoh says.
+
+    where: endpoints, separated by commas; the first is asked. names: whether its certificate has to name it.
+    """
+    return f"no router at {where}: {_objection(where, login, names=names) or plain(str(error))}"
+
+
+def plain(said: str) -> str:
+    """The first line of what Zenoh says, without the places in its source."""
+    return re.sub(r",? at /\S+", "", said.splitlines()[0] if said else "")[:300]
+
+
+def _objection(where: str, login: Login, *, names: bool) -> str | None:
+    found = re.fullmatch(r"tls/\[?([^#?]+?)\]?:(\d+)(?:[#?].*)?", where.split(",", maxsplit=1)[0].strip())
+    if found is None:
+        return None
+    try:
+        context = trusting(login.ca) if login.ca is not None else ssl.create_default_context()
+        context.check_hostname = names
+        if login.certificate is not None and login.key is not None:
+            _show(context, login.certificate, login.key)
+        with (
+            socket.create_connection((found[1], int(found[2])), PROBE_SECONDS) as bare,
+            context.wrap_socket(bare, server_hostname=found[1]) as link,
+        ):
+            link.recv(1)  # who does not like our certificate says so only now
+    except ssl.SSLCertVerificationError as error:
+        return f"its certificate is not to be trusted: {error.verify_message}"
+    except ssl.SSLError as error:
+        return f"it refuses: {(error.reason or str(error)).replace('_', ' ').lower()}"
+    except (OSError, Invalid):
+        return None
+    return None

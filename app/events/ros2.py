@@ -25,7 +25,7 @@ from zenoh import ext
 
 from app.errors import FleetMapError
 from app.events import cdr, ros_names, single
-from app.events.bus import BusOptions, plain, session_configuration
+from app.events.bus import BusOptions, no_connection, session_configuration
 from app.events.ros_names import Chosen, Keys, Topic
 from app.events.single import POLL_SECONDS, Single
 from app.store.values import Version
@@ -185,7 +185,7 @@ class Ros2(Single):
             raise
         except Exception as error:  # noqa: BLE001  zenoh raises one class for everything
             self._shut()
-            self._note({"state": "down", "detail": f"no router: {plain(str(error))}"})
+            self._note({"state": "down", "detail": no_connection(self._bus, error)})
             return False
         return True
 

@@ -75,6 +75,10 @@ def eventually(condition: Callable[[], Any], seconds: float = 20.0) -> Any:
         time.sleep(0.02)
 
 
+def nothing(*_: Any) -> Any:
+    """What nobody asks for."""
+
+
 def said(n: int, state: str = "active") -> bytes:
     """What a robot says: that it holds version ``n``."""
     body = {"channel": "latest", "version": n, "root": f"{n:064x}", "state": state, "sequence": n}

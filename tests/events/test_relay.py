@@ -7,7 +7,6 @@ import logging
 import os
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zenoh
@@ -18,7 +17,7 @@ from app.events.messages import Event, RobotStatus
 from app.events.router import Router
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
-from tests.events.conftest import Listener, client_config, eventually, free_port
+from tests.events.conftest import Listener, client_config, eventually, free_port, nothing
 
 
 def network(k: int) -> bytes:
@@ -127,10 +126,6 @@ def test_a_taken_port_is_not_tried_all_the_time(monkeypatch: pytest.MonkeyPatch)
         eventually(bus.tend)
     finally:
         bus.close()
-
-
-def nothing(*_: Any) -> Any:
-    """What nobody asks for."""
 
 
 def test_a_router_of_the_operators(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -14,18 +14,19 @@ from typing import Any
 import pytest
 import zenoh
 
+from app.agent.ear import Ear
 from app.cli.serving import check
 from app.errors import Invalid, Unavailable
-from app.events.bus import BusOptions, router_configuration, session_configuration
+from app.events.bus import Bus, BusOptions, router_configuration, session_configuration
 from app.events.bus import check as check_bus
-from app.events.login import Login
+from app.events.login import Login, no_router
 from app.events.router import Router
 from app.events.security import Security, access_control, read_users
 from app.main import check_bus as check_settings
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 from tests.certificates import Authority
-from tests.events.conftest import Listener, client_config, eventually, free_port, said
+from tests.events.conftest import Listener, client_config, eventually, free_port, nothing, said
 from tests.events.test_fleet import robot_of
 from tests.events.test_ros2 import GRID, STRING, Heard, grid_of, tokens
 
@@ -282,6 +283,54 @@ def test_the_server_is_a_user_of_somebody_elses_router(authority: Authority, tmp
         router.close()
 
 
+@pytest.mark.parametrize(
+    ("days", "foreign", "told"),
+    [(-1, False, "certificate has expired"), (2, True, "unable to get local issuer certificate")],
+)
+def test_why_a_certificate_is_not_trusted_is_told(
+    authority: Authority, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, days: int, foreign: bool, told: str
+) -> None:
+    monkeypatch.setattr("app.events.bus.CONNECT_SECONDS", REFUSED_SECONDS)
+    port = free_port()
+    where = f"tls/127.0.0.1:{port}"
+    certificate, key = (Authority(tmp_path, "others") if foreign else authority).sign("own", days)
+    options = BusOptions(listen=where, security=Security(Login(authority.pem, certificate, key)))
+    bus = Bus(options, ask=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
+    try:
+        assert not bus.tend()
+        assert bus.state["detail"] == f"no router at {where}: its certificate is not to be trusted: {told}"
+        refused(port, Login(authority.pem))
+        ear = Ear("farm", "r1", heard=nothing, back=nothing, login=Login(authority.pem))
+        monkeypatch.setattr("app.agent.ear.CONNECT_MS", int(REFUSED_SECONDS * 1000))
+        ear.aim(where, "fleetmap")
+        try:
+            eventually(lambda: ear.problem and told in ear.problem)
+        finally:
+            ear.close()
+    finally:
+        bus.close()
+
+
+def test_why_a_robot_is_not_let_in_is_told(authority: Authority, tmp_path: Path) -> None:
+    where = f"tls/127.0.0.1:{free_port()}"
+    mutual = Security(Login(authority.pem, *authority.sign("strict")), mutual=True)
+    router = Router(router_configuration(BusOptions(listen=where, security=mutual)))
+    assert router.problem is None
+    error = zenoh.ZError("Unable to connect! at /somewhere/else.rs:1")
+    try:
+        for login, told in (
+            (Login(authority.pem), "it refuses: tlsv13 alert certificate required"),
+            (Login(authority.pem, *authority.sign("late", -1)), "it refuses: sslv3 alert certificate expired"),
+            (Login(authority.pem, *Authority(tmp_path, "x").sign("r")), "it refuses: "),
+            (Login(authority.pem, *authority.sign("r1")), "Unable to connect!"),
+        ):
+            assert no_router(f"{where}, tcp/x:1", error, login).startswith(f"no router at {where}, tcp/x:1: {told}")
+    finally:
+        router.close()
+    for gone in (where, "tcp/127.0.0.1:1", "tls/[::1]:1", "what is this"):
+        assert no_router(gone, error, Login(authority.pem)) == f"no router at {gone}: Unable to connect!"
+
+
 # --- what an operator writes ----------------------------------------------------------------------------------------
 def test_a_file_of_users(tmp_path: Path) -> None:
     path = tmp_path / "users"
@@ -320,6 +369,13 @@ def test_a_missing_file_is_told_before_the_start(tmp_path: Path) -> None:
             check_bus(BusOptions(mode="client", connect="tcp/x:1", security=Security(login)))
     with pytest.raises(Unavailable, match="FLEETMAP_ZENOH_CONFIG"):
         check_bus(BusOptions(config=gone))
+    here.write_text("no PEM")
+    with pytest.raises(Invalid, match="holds no certificate of a certification authority"):
+        check_bus(BusOptions(security=Security(Login(ca=here))))
+    one, other = Authority(tmp_path / "ca").sign("one"), Authority(tmp_path / "ca").sign("other")
+    for certificate, key in ((one[0], other[1]), (here, one[1]), (one[0], here)):
+        with pytest.raises(Invalid, match="are no certificate and its unencrypted key"):
+            check_bus(BusOptions(security=Security(Login(certificate=certificate, key=key))))
     assert "secret" not in repr(Login(user="a", password="secret"))
 
 
