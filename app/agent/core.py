@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import errno
 import random
 import re
 import socket
@@ -310,8 +311,7 @@ class Agent:
             self._fail("refused" if isinstance(error, Untrusted) else "failed", error.detail)
             good = False
         except OSError as error:
-            where = f"{error.filename}: " if error.filename else ""
-            self._fail("failed", f"{where}{error.strerror or error}")
+            self._fail("failed", f"{error.filename or self._folder.path}: {error.strerror or error}")
             good = False
         self._send_status()
         return good
@@ -546,7 +546,13 @@ class Agent:
         if state != self._state:
             self._state, self._unsaved = state, True
         if self._unsaved:
-            save(self._folder.state, state)
+            try:
+                save(self._folder.state, state)
+            except OSError as error:
+                if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                    raise
+                self._folder.spare()
+                save(self._folder.state, state)
             self._unsaved = False
 
     _unsaved = False

@@ -5,7 +5,7 @@
     DIR/current -> versions/7-9f3c21aa       switched by one rename: what it names is always whole and verified
     DIR/versions/7-9f3c21aa/<format>/<file>  with manifest.json, manifest.sig and environment.sh
     DIR/partial/<sha256>[.part]              what was fetched, whole or not yet
-    DIR/state.json, DIR/lock
+    DIR/state.json, DIR/lock, DIR/changed    the last: what the hooks were told that changed
 
 Files that did not change are hard links to those of the version before, so they are read-only.
 """
@@ -219,6 +219,11 @@ class Folder:
         """Remove versions beyond the kept ones, and fetched files but those to keep."""
         self._drop(KEPT)
         self._forget(keep)
+
+    def spare(self) -> None:
+        """Keep nothing but what stands: for a disk that is full."""
+        self._drop(0)
+        self._forget(())
 
     def _drop(self, kept: int, needed: Iterable[Path] = ()) -> None:
         """Remove versions beside the current one but so many, the last used ones, and those of needed files."""

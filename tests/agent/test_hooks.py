@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import threading
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -125,6 +128,44 @@ def test_a_hanging_hook_is_ended(tmp_path: Path) -> None:
     assert "took more than 0.5 seconds" in told
     pid = int((tmp_path / "pid").read_text())
     eventually(lambda: _ended(pid))  # what was killed takes a moment to end on a busy machine
+
+
+def test_a_hook_that_prints_without_end_fills_nothing() -> None:
+    before = tracemalloc_peak(lambda: None)
+    told: list[str | None] = []
+    peak = tracemalloc_peak(
+        lambda: told.append(hooks.run("head -c 50000000 /dev/zero | tr '\\0' x; echo; echo the end; exit 3", {}))
+    )
+    assert told[0] is not None
+    assert told[0].endswith("the end")
+    assert len(told[0]) < 2000
+    assert peak - before < 2**20
+
+
+def tracemalloc_peak(do: Callable[[], object]) -> int:
+    tracemalloc.start()
+    try:
+        do()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_what_a_hook_leaves_in_the_background_lives_on(tmp_path: Path) -> None:
+    background = f"(while [ ! -e {tmp_path}/end ]; do echo x; sleep 0.05; done; touch {tmp_path}/lived) & exit 0"
+    assert hooks.run(background, {}, seconds=30) is None
+    (tmp_path / "end").touch()
+    eventually((tmp_path / "lived").exists)
+
+
+def test_a_hook_ends_with_the_agent(tmp_path: Path) -> None:
+    stopping = threading.Event()
+    threading.Timer(0.2, stopping.set).start()
+    told = hooks.run(f"sleep 60 & echo $! > {tmp_path}/pid; wait", {}, stopping=stopping)
+    assert told is not None
+    assert "was ended with the agent" in told
+    pid = int((tmp_path / "pid").read_text())
+    eventually(lambda: _ended(pid))
 
 
 def _ended(pid: int) -> bool:

@@ -467,6 +467,56 @@ def test_old_parts_and_versions_make_room(fake: Fake, robot: Robot, monkeypatch:
     assert whole(one.into)["version"] == 4
 
 
+def test_on_a_full_disk_old_versions_go_before_the_memory(
+    fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert robot().once()
+    fake.put(B)
+    assert robot().once()
+    fake.put(A)
+    real, into = os.fsync, robot().into
+
+    def full(descriptor: int) -> None:
+        if len(list((into / "versions").iterdir())) > 1:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(descriptor)
+
+    one = robot()
+    one.agent.open()
+    monkeypatch.setattr(os, "fsync", full)
+    assert not one.agent.once(), "there is room for the memory, and not for the map"
+    assert f"{into}: No space left" in one.detail
+    assert json.loads((into / "state.json").read_text())["marks"]["latest"]["sequence"] == 3
+    assert whole(into)["version"] == 2
+    monkeypatch.undo()
+    assert one.agent.once()
+    one.agent.close()
+    assert whole(into)["version"] == 3
+
+
+def test_a_server_that_was_set_up_anew(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    fake.put(B)
+    assert robot().once()
+    anew = Fake(tmp_path / "other")
+    try:
+        anew.put(A)
+        one = One(anew, robot().into)
+        assert not one.once()
+        assert "Is this another server? If it is meant to be" in one.detail
+        assert whole(one.into)["version"] == 2
+        anew.keys = fake.keys
+        one = One(anew, robot().into)
+        assert not one.once()
+        assert "If the server was set up anew, remove state.json" in one.detail
+        (one.into / "state.json").unlink()
+        one = One(anew, robot().into)
+        assert one.once()
+        assert whole(one.into)["version"] == 1
+        assert one.saw("trusting", detail="first contact")
+    finally:
+        anew.close()
+
+
 def test_names_that_are_one_on_this_file_system(fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     fake.put({"kml/Map.kml": b"a", "kml/map.kml": b"b"})
 
