@@ -24,7 +24,7 @@ from typing import IO
 
 from app.agent.state import sync_folder, write_new
 from app.agent.trust import File, Manifest, parse
-from app.errors import Conflict, Unavailable, Untrusted
+from app.errors import Conflict, Invalid, Unavailable, Untrusted
 
 KEPT = 2
 """Old versions that stay, beside the current one."""
@@ -53,9 +53,12 @@ class Folder:
         handle = (self.path / "lock").open("a")
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             handle.close()
             raise Conflict(f"another agent keeps {self.path}") from None
+        except OSError as error:
+            handle.close()
+            raise Invalid(f"{self.path} cannot be locked ({error.strerror}): use a folder on another disk") from None
         self._lock = handle
         for left in self.versions.glob(".*"):
             shutil.rmtree(left, ignore_errors=True)

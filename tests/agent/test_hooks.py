@@ -80,6 +80,23 @@ def test_nav2_loads_what_changed(ros: Path, current: Path) -> None:
     ]
 
 
+def test_nav2_cannot_unload_and_says_so(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (current / "occupancy_grid" / "keepout.yaml").unlink()
+    (current / "nav2_route" / "graph.geojson").unlink()
+    changed = (
+        "occupancy_grid/keepout.pgm\noccupancy_grid/keepout.yaml\noccupancy_grid/map.pgm\nnav2_route/graph.geojson"
+    )
+    variables = {"FLEETMAP_CURRENT": str(current), "FLEETMAP_CHANGED": changed}
+    told = hooks.run("nav2", variables)
+    assert told is not None
+    assert "the grid keepout is no longer part of the map; Nav2 goes on with the one of before" in told
+    assert "the route graph is no longer part of the map" in told
+    assert [line.split()[2] for line in ros.read_text().splitlines()] == ["/map_server/load_map"], "the rest is loaded"
+    monkeypatch.setenv("FLEETMAP_NAV2_KEEPOUT_SERVER", "")
+    monkeypatch.setenv("FLEETMAP_NAV2_ROUTE_SERVER", "")
+    assert hooks.run("nav2", variables) is None, "who runs no such server has nothing to unload"
+
+
 def test_nav2_says_what_was_not_taken(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     variables = {"FLEETMAP_CURRENT": str(current), "FLEETMAP_CHANGED": "occupancy_grid/map.yaml"}
     for result in ("1", "255", "10"):

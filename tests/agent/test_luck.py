@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import gzip
 import hashlib
 import json
@@ -22,7 +23,7 @@ import pytest
 
 from app.agent import core, folder, web
 from app.agent.ear import Ear
-from app.errors import Conflict
+from app.errors import Conflict, Invalid
 from app.events import messages
 from tests.agent.conftest import ROOT, whole
 from tests.agent.fake import PLACE, Fake, One, send
@@ -542,6 +543,17 @@ def test_a_file_system_without_hard_links(fake: Fake, robot: Robot, monkeypatch:
         one = robot()
         assert one.once(), one.lines
         assert whole(one.into)["version"] == number + 2
+
+
+def test_a_file_system_without_locks_is_no_other_agent(
+    fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(Invalid, match=r"cannot be locked \(No locks available\)"):
+        robot().once()
 
 
 def test_what_lies_ready_is_looked_at_again(fake: Fake, robot: Robot) -> None:

@@ -29,8 +29,17 @@ call() {  # service, type, request, what the answer has where it worked
   fi
 }
 
+gone() {  # what, file: Nav2 has no service that unloads
+  if changed "$2" && [ ! -e "$here/$2" ]; then
+    echo "$1 is no longer part of the map; Nav2 goes on with the one of before until it is started anew"
+    failed=1
+  fi
+}
+
 load_map() {  # node, grid
-  [ -n "$1" ] && [ -f "$here/occupancy_grid/$2.yaml" ] || return 0
+  [ -n "$1" ] || return 0
+  gone "the grid $2" "occupancy_grid/$2.yaml"
+  [ -f "$here/occupancy_grid/$2.yaml" ] || return 0
   changed "occupancy_grid/$2.yaml" "occupancy_grid/$2.pgm" "occupancy_grid/$2.png" || return 0
   call "$1/load_map" nav2_msgs/srv/LoadMap "{map_url: '$(quoted "$here/occupancy_grid/$2.yaml")'}" 'result=0([^0-9]|$)'
 }
@@ -40,6 +49,7 @@ load_map "${FLEETMAP_NAV2_KEEPOUT_SERVER-/keepout_filter_mask_server}" keepout
 load_map "${FLEETMAP_NAV2_SPEED_SERVER-/speed_filter_mask_server}" speed
 
 route=${FLEETMAP_NAV2_ROUTE_SERVER-/route_server}
+[ -z "$route" ] || gone "the route graph" nav2_route/graph.geojson
 if [ -n "$route" ] && [ -f "$here/nav2_route/graph.geojson" ] && changed nav2_route/graph.geojson; then
   call "$route/set_route_graph" nav2_msgs/srv/SetRouteGraph \
     "{graph_filepath: '$(quoted "$here/nav2_route/graph.geojson")'}" 'success=True'
