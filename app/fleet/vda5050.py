@@ -1,5 +1,8 @@
 """VDA 5050 (3.0, sections 6.3 and 6.4): instant actions that bring a map to a vehicle, and what its state says of maps.
 
+Vehicles of 2.1 understand the same actions. Their states tell of them in ``actionStates`` (``resultDescription``),
+those of 3.0 in ``instantActionStates`` (``actionResult``, and why in ``errors``); 2.0 knows no maps.
+
 Only the messages' content: carrying it over MQTT, with its header, is the fleet manager's. An action's id tells what it
 is about (``downloadMap:<mapId>:<mapVersion>:<unique>``), so that a state that says it failed can be understood. A state
 says which map is enabled (the vehicle drives on it) or disabled (it has it); optional fields may be absent or null.
@@ -25,14 +28,13 @@ _ACTION_ID = re.compile(r"(downloadMap|enableMap):(.+):([0-9]{1,9}):[^:]*", re.D
 def action(kind: Action, map_id: str, version: int, unique: str, **more: str) -> dict[str, Any]:
     """One instant action. unique: what no other action has. more: further parameters.
 
-    Enabling another map takes a vehicle that stands still and does nothing else (blocking type HARD); fetching and
-    deleting goes on beside driving.
+    The blocking type of an instant action is always NONE in 3.0, whose schema refuses others, and may be so before.
     """
     parameters = {"mapId": map_id, "mapVersion": str(version), **more}
     return {
         "actionType": kind,
         "actionId": f"{kind}:{map_id}:{version}:{unique}",
-        "blockingType": "HARD" if kind == "enableMap" else "NONE",
+        "blockingType": "NONE",
         "actionParameters": [{"key": key, "value": value} for key, value in parameters.items()],
     }
 
@@ -67,32 +69,56 @@ def read_state(message: Any) -> tuple[Maps, ...]:
     for map_id, versions in enabled.items():
         if len(set(versions)) > 1:
             raise _refused(f"several versions of {map_id[:80]} are ENABLED: at most one may be", "maps")
-    for k, item in enumerate(_list(message, "actionStates", MAX_ACTIONS)):
-        ours = _ACTION_ID.fullmatch(str(item.get("actionId")))
-        if ours is None or item.get("actionStatus") != "FAILED":
+    for (kind, map_id, version), why in _failures(message).items():
+        if kind == "downloadMap" and version in (*enabled.get(map_id, ()), *disabled.get(map_id, ())):
             continue
-        why = item.get("resultDescription")
-        if why is not None and not isinstance(why, str):
-            raise _refused("must be a text", f"actionStates[{k}].resultDescription")
-        map_id, version = ours[2], ours[3]
-        if ours[1] == "downloadMap" and version in (*enabled.get(map_id, ()), *disabled.get(map_id, ())):
-            continue
-        failed.setdefault(map_id, []).append((version, why or "the vehicle does not say why"))
+        failed.setdefault(map_id, []).append((version, why))
     names = sorted(enabled.keys() | disabled.keys() | failed.keys())
     return tuple(
         Maps(n, tuple(enabled.get(n, ())[:1]), tuple(disabled.get(n, ())), tuple(failed.get(n, ()))) for n in names
     )
 
 
-def _list(message: Mapping[str, Any], name: str, most: int) -> Sequence[Mapping[str, Any]]:
+def _failures(message: Mapping[str, Any]) -> dict[tuple[str, str, str], str]:
+    """Of our actions (what, map, version) those that failed, or wait for another try, and why.
+
+    Vehicles keep what failed in their lists: the same tried again, further down, counts instead.
+    """
+    told: dict[str, str] = {}
+    for k, error in enumerate(_list(message, "errors", MAX_ACTIONS)):
+        for reference in _list(error, "errorReferences", MAX_ACTIONS, f"errors[{k}]."):
+            if reference.get("referenceKey") == "actionId":
+                why = error.get("errorDescription") or error.get("errorType")
+                told.setdefault(str(reference.get("referenceValue")), why if isinstance(why, str) else "")
+    out: dict[tuple[str, str, str], str] = {}
+    for name in ("actionStates", "instantActionStates"):
+        for k, item in enumerate(_list(message, name, MAX_ACTIONS)):
+            ours = _ACTION_ID.fullmatch(str(item.get("actionId")))
+            if ours is None:
+                continue
+            about = (ours[1], ours[2], ours[3])
+            out.pop(about, None)
+            if item.get("actionStatus") not in ("FAILED", "RETRIABLE"):
+                continue
+            reasons = [told.get(ours[0])]
+            for member in ("actionResult", "resultDescription"):
+                text = item.get(member)
+                if text is not None and not isinstance(text, str):
+                    raise _refused("must be a text", f"{name}[{k}].{member}")
+                reasons.insert(0, text)
+            out[about] = next((text for text in reasons if text), "the vehicle does not say why")
+    return out
+
+
+def _list(message: Mapping[str, Any], name: str, most: int, within: str = "") -> Sequence[Mapping[str, Any]]:
     found = message.get(name)
     if found is None:
         return ()
     if not isinstance(found, list) or len(found) > most:
-        raise _refused(f"must be a list of at most {most}", name)
+        raise _refused(f"must be a list of at most {most}", within + name)
     for k, item in enumerate(found):
         if not isinstance(item, Mapping):
-            raise _refused("must be an object", f"{name}[{k}]")
+            raise _refused("must be an object", f"{within}{name}[{k}]")
     return found
 
 

@@ -33,7 +33,7 @@ def test_actions_name_the_very_bytes(api: Api, farm: str) -> None:
     assert (told["mapId"], told["mapVersion"], told["version"]) == ("hall", "3", 3)
     actions = [told[k] for k in ("downloadMap", "enableMap", "deleteMap")]
     assert [a["actionType"] for a in actions] == ["downloadMap", "enableMap", "deleteMap"]
-    assert [a["blockingType"] for a in actions] == ["NONE", "HARD", "NONE"]
+    assert [a["blockingType"] for a in actions] == ["NONE"] * 3, "3.0 allows no other for instant actions"
     assert all(parameters(a)["mapId"] == "hall" and parameters(a)["mapVersion"] == "3" for a in actions)
     assert set(actions[0]) == {"actionType", "actionId", "blockingType", "actionParameters"}
     given = parameters(actions[0])
@@ -102,6 +102,8 @@ def test_what_is_not_known_is_told(api: Api, farm: str, bare: str) -> None:
         {"maps": [{"mapId": "a", "mapVersion": "1", "mapStatus": None}]}, maps("a", ("1", "ENABLED"), ("2", "ENABLED")),
         {"maps": [None] * 1001}, {"actionStates": "x"},
         {"actionStates": [{"actionId": "enableMap:a:1:x", "actionStatus": "FAILED", "resultDescription": 3}]},
+        {"instantActionStates": [{"actionId": "enableMap:a:1:x", "actionStatus": "FAILED", "actionResult": []}]},
+        {"errors": {}}, {"errors": [{"errorReferences": [1]}]}, {"instantActionStates": 1},
     ],
 )  # fmt: skip
 def test_bad_states_are_refused(bad: Any) -> None:
@@ -119,6 +121,30 @@ def test_a_state_with_nulls() -> None:
     assert read_state({**maps("a", ("1", "DISABLED")), "actionStates": states}) == (
         Maps("a", (), ("1",), ()),
         Maps("x:y", (), (), (("7", "the vehicle does not say why"),)),
+    )
+
+
+def test_a_state_of_3_0() -> None:
+    """Instant actions have a list of their own, stay in it, and may wait for another try; reasons are among errors."""
+    states = [
+        {"actionId": "downloadMap:a:3:1", "actionType": "downloadMap", "actionStatus": "FAILED"},
+        {"actionId": "downloadMap:a:4:1", "actionStatus": "FAILED", "actionResult": "no room"},
+        {"actionId": "downloadMap:a:5:1", "actionStatus": "FAILED"},
+        {"actionId": "downloadMap:a:5:2", "actionStatus": "RUNNING"},
+        {"actionId": "downloadMap:b:6:1", "actionStatus": "RETRIABLE"},
+        {"actionId": "enableMap:b:7:1", "actionStatus": "FAILED"},
+    ]
+    reference = [{"referenceKey": "actionId", "referenceValue": "downloadMap:a:3:1"}]
+    other = [{"referenceKey": "actionId", "referenceValue": "enableMap:b:7:1"}, {"referenceKey": "mapId"}]
+    errors = [
+        {"errorType": "DOWNLOAD", "errorLevel": "WARNING", "errorReferences": reference, "errorDescription": "404"},
+        {"errorType": "UNKNOWN_MAP_ID", "errorLevel": "WARNING", "errorReferences": other},
+        {"errorType": "other", "errorLevel": "WARNING"},
+    ]
+    message = maps("a", ("1", "ENABLED"), instantActionStates=states, errors=errors, zoneActionStates=None)
+    assert read_state(message) == (
+        Maps("a", ("1",), (), (("3", "404"), ("4", "no room"))),
+        Maps("b", (), (), (("6", "the vehicle does not say why"), ("7", "UNKNOWN_MAP_ID"))),
     )
 
 
