@@ -67,7 +67,7 @@ def get_robot(
         raise NotFound(f"no robot {robot[:80]!r} has reported{where}")
     newest = max(chosen, key=lambda r: r.time)
     history = here.store.robot_history(newest.environment, robot, limit)
-    (body,) = _told(here, [newest])
+    body = _one(here, [newest])
     body["environments"] = [r.environment for r in found]
     body["history"] = [{**_report(report, time), "received": rfc3339(time)} for time, report in history]
     return answer(body)
@@ -97,8 +97,7 @@ async def put_status(
     fleet.settle(noting)
     if prefer is not None and prefer.strip().lower() == "return=minimal":
         return Response(status_code=204, headers={"preference-applied": "return=minimal"})
-    (as_it_is,) = await run_in_threadpool(lambda: _told(here, here.store.robots(body.environment, robot)))
-    return answer(as_it_is)
+    return answer(await run_in_threadpool(lambda: _one(here, here.store.robots(body.environment, robot))))
 
 
 @router.delete("/{robot}", status_code=204, responses=told(None, 404), summary="Forget a robot that is gone for good")
@@ -125,24 +124,35 @@ def may_report(who: Principal, robot: str) -> None:
 def noted(here: Services, environment: str, robot: str, report: Report) -> dict[str, Any]:
     """Store a report; the robot as it is now."""
     here.fleet.note(Heard(environment, robot, report, datetime.now(UTC)))
-    return _told(here, here.store.robots(environment, robot))[0]
+    return _one(here, here.store.robots(environment, robot))
+
+
+def _one(here: Services, robots: Sequence[Robot]) -> dict[str, Any]:
+    """The only one of them; NotFound where it, or its environment, went meanwhile."""
+    for body in _told(here, robots):
+        return body
+    raise NotFound("the robot, or its environment, is no longer there")
 
 
 def _told(here: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
+    """As clients see them; without those whose environment is deleted meanwhile."""
     now = datetime.now(UTC)
     channels: dict[str, dict[str, Channel]] = {}
     moves: dict[tuple[str, str], list[Move]] = {}
     out = []
     for robot in robots:
         name = robot.report.channel
-        if robot.environment not in channels:
-            channels[robot.environment] = {c.name: c for c in here.store.channels(robot.environment)}
-        channel = channels[robot.environment].get(name)
-        lag = None
-        if channel is not None and channel.root is not None:
-            behind = robot.held is None or robot.held.root != channel.root
+        try:
+            if robot.environment not in channels:
+                channels[robot.environment] = {c.name: c for c in here.store.channels(robot.environment)}
+            channel = channels[robot.environment].get(name)
+            behind = channel is not None and (robot.held is None or robot.held.root != channel.root)
             if behind and (robot.environment, name) not in moves:
                 moves[robot.environment, name] = here.store.moves(robot.environment, name)
+        except NotFound:
+            continue  # its environment went since
+        lag = None
+        if channel is not None and channel.root is not None:
             lag = fleet.lag_of(robot, channel, moves.get((robot.environment, name), [])).as_dict()
         held = robot.held
         body = {"robot": robot.robot, "environment": robot.environment, **_report(robot.report, robot.time)}

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 from fastapi import Header, Path, Query
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from app.api.problems import MEDIA_TYPE
 from app.model.frame import MAX_DATUM_LATITUDE
@@ -352,6 +352,14 @@ class ChannelBody(In):
         None, description="RFC 3339 time with zone at which the channel moves; left out: now."
     )
     rollout: RolloutBody | None = Field(None, description="Let robots fetch it first, and watch them afterwards.")
+
+    @field_validator("version", mode="before")
+    @classmethod
+    def _no_truth(cls, value: Any) -> Any:
+        """To JSON ``true`` is no number."""
+        if isinstance(value, bool):
+            raise ValueError("a version is a number or a channel's name")
+        return value
 
 
 class StatusBody(In):

@@ -132,9 +132,13 @@ class Database:
 
 @contextmanager
 def translated() -> Iterator[None]:
-    """Database errors -> Unavailable."""
+    """Database errors -> Unavailable; Invalid for a NUL that somebody asks for, which PostgreSQL has no text with."""
     try:
         yield
+    except exc.DataError as error:
+        if "NUL" not in _short(error):
+            raise
+        raise Invalid("a name or text has a NUL character: nothing here has one") from error
     except (exc.OperationalError, exc.InterfaceError, exc.TimeoutError, exc.InternalError) as error:
         raise Unavailable(f"the database does not answer as it should: {_short(error)}. Try again later") from error
 

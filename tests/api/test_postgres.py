@@ -86,3 +86,16 @@ def test_writers_at_once(api: Api) -> None:
     api.post("environments", {"name": "farm"})
     api.upload("farm", {"n.tmap2.yaml": samples.tmap2()})
     races(api, "farm")
+
+
+def test_a_nul_is_never_a_mistake_of_the_server(api: Api) -> None:
+    """PostgreSQL refuses texts with NUL, also where they are only looked for."""
+    api.post("environments", {"name": "farm"})
+    state = {"maps": [{"mapId": "\0", "mapVersion": "1", "mapStatus": "ENABLED"}]}
+    for method, path, body in (
+        ("GET", "robots?cursor=%00/x", None), ("GET", "environments?cursor=%00", None), ("GET", "jobs/%00", None),
+        ("GET", "events?environment=%00&follow=false", None), ("POST", "robots/x/vda5050/state", state),
+        ("PUT", "environments/farm/channels/production", {"version": "\0"}),
+        ("POST", "environments/farm/overlays/a%00/accept", None),
+    ):  # fmt: skip
+        assert "NUL" in api.problem(method, path, 422, json=body)["detail"]

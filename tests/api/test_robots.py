@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
@@ -101,6 +102,28 @@ def test_the_list_comes_in_pages(api: Api, farm: str, bare: str) -> None:
     assert walk(limited, "robots?limit=1") == [(bare, "a"), (bare, "z")]
     api.problem("GET", "robots?cursor=x", 422)
     api.problem("GET", "robots?limit=0", 422)
+
+
+def test_an_environment_that_goes_meanwhile_takes_its_robots_along(
+    api: Api, farm: str, bare: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = root_of(api, farm, 2)
+    for env in (farm, bare):
+        api("PUT", "robots/goer/status", 200, json=status(env, root))
+    store = type(api.app.state.services.store)
+    quick = store.channels
+
+    def gone(self: Any, environment: str) -> Any:
+        if environment == farm and self.environment(farm, deleted=True).deleted is None:
+            self.delete_environment(farm)
+        return quick(self, environment)
+
+    monkeypatch.setattr(store, "channels", gone)
+    assert farm not in {r["environment"] for r in api.get("robots?limit=1000").json()}
+    for method, path in (("GET", f"robots/goer?environment={farm}"), ("PUT", "robots/goer/status")):
+        api("POST", f"environments/{farm}/restore", 200)
+        assert api(method, path, None, json=status(farm, root) if method == "PUT" else None).status_code in (404, 410)
+    assert api.get("robots/goer").json()["environment"] == bare
 
 
 def test_history_of_a_robot(api: Api, farm: str) -> None:
@@ -206,3 +229,19 @@ def test_a_rollout(api: Api, farm: str) -> None:
     late = {"ready": 1, "deadline": "2098-01-01T00:00:00Z"}
     api.problem("PUT", url, 422, json={"version": 3, "activate_at": "2099-01-01T00:00:00Z", "rollout": late})
     api.token_for("robot", robot="two-1").problem("PUT", url, 403, json={"version": 3})
+
+
+def test_a_plan_of_somebody_whose_clock_is_slow(api: Api, farm: str) -> None:
+    """Planned for half a minute ahead by a clock that is a minute behind: no mistake, and it is due."""
+    channel = f"environments/{farm}/channels/production"
+    at = datetime.now(UTC) - timedelta(seconds=30)
+    planned = api("PUT", channel, 200, json={"version": 2, "activate_at": at.isoformat()}).json()
+    assert (planned["version"], planned["planned"]["version"]) == (None, 2)
+    deadline = time.monotonic() + 20
+    while (now := api.get(f"environments/{farm}/channels").json()[-1])["version"] is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert (now["version"], now["planned"]) == (2, None)
+    at -= timedelta(seconds=40)
+    api.problem("PUT", channel, 422, json={"version": 3, "activate_at": at.isoformat()})
+    api.problem("PUT", channel, 422, json={"version": True})
