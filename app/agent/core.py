@@ -10,6 +10,7 @@ import re
 import socket
 import threading
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -313,6 +314,11 @@ class Agent:
         except OSError as error:
             self._fail("failed", f"{error.filename or self._folder.path}: {error.strerror or error}")
             good = False
+        except Exception as error:  # noqa: BLE001  a mistake of ours; who ends here is of no use to a robot
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{Path(where.filename).name}:{where.lineno}"
+            self._fail("failed", f"the agent made a mistake ({type(error).__name__} at {place}): {error}")
+            good = False
         self._send_status()
         return good
 
@@ -400,7 +406,10 @@ class Agent:
         """Fetch what is not here, build the version, switch to it."""
         name = self._folder.standing
         installed = self._folder.manifest(name)
-        whole = name is not None and installed is not None and not self._folder.damaged(name, installed)
+        bad = self._folder.damaged(name, installed) if name is not None and installed is not None else []
+        if bad and installed is not None:
+            self._tell("damaged", version=installed.version, files=bad[:20])
+        whole = installed is not None and not bad
         if not (whole and installed and (installed.content, installed.root) == (manifest.content, manifest.root)):
             received, deltas, begun = self._web.received, self._web.deltas, time.monotonic()
             self._target = (manifest.version, manifest.root)

@@ -27,6 +27,7 @@ CLOCKS_DIFFER = timedelta(seconds=60)
 
 MAX_FILES = 100_000
 MAX_VARIABLES = 2000
+MAX_DEPTH = 100
 _HASH = re.compile(r"[0-9a-f]{64}")
 _FORMAT = re.compile(r"[a-z0-9][a-z0-9_]{0,62}")
 _LAYER = re.compile(r"[a-z][a-z0-9_]{0,31}")
@@ -129,7 +130,11 @@ def _check_paths(files: Sequence[File]) -> None:
     for file in files:
         known = isinstance(file.format, str) and _FORMAT.fullmatch(file.format)
         pieces = file.name.split("/") if isinstance(file.name, str) else [""]
-        fine = known and all(p not in ("", ".", "..") and len(p.encode("utf-8", "replace")) <= 255 for p in pieces)
+        fine = (
+            known
+            and len(pieces) <= MAX_DEPTH
+            and all(p not in ("", ".", "..") and len(p.encode("utf-8", "replace")) <= 255 for p in pieces)
+        )
         if not fine or "\\" in file.name or not file.name.isprintable() or file.path in seen:
             raise Untrusted(f"the manifest names a file that cannot be: {file.format!r}/{file.name!r}")
         seen.add(file.path)

@@ -171,6 +171,8 @@ def test_an_old_manifest_is_refused(api: Api, held: str, robot: Start, gate: Gat
         ({"files": [{"format": "tmap2", "name": "/etc/x", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
         ({"files": [{"format": "..", "name": "x", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
         ({"files": [{"format": "tmap2", "name": "a\nb", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
+        ({"files": [{"format": "tmap2", "name": "a/" * 1500 + "b", "size": 1, "sha256": "0" * 64}]}, "cannot be"),
+        ({"files": [{"format": "tmap2", "name": "x" * 300, "size": 1, "sha256": "0" * 64}]}, "cannot be"),
         ({"files": [{"format": "tmap2", "name": "x", "size": 1, "sha256": "../../x"}]}, "cannot be read"),
         ({"files": [{"format": "tmap2", "name": n, "size": 1, "sha256": "0" * 64} for n in ("a", "a/b")]}, "folder"),
         ({"files": 7}, "cannot be read"),

@@ -371,6 +371,24 @@ def test_it_ends_at_once_while_a_server_hangs(fake: Fake, robot: Robot, part: st
     gone.set()
 
 
+def test_a_mistake_of_ours_is_told_and_gone_on_from(fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong(*_: Any) -> None:
+        raise KeyError("x")
+
+    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 0.02)
+    assert robot().once()
+    fake.put(B)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(folder.Folder, "build", wrong)
+        one = robot(poll_seconds=3600.0)
+        with run(one):
+            eventually(lambda: one.saw("failed"))
+            assert "made a mistake (KeyError at test_luck.py:" in one.detail
+            eventually(lambda: fake.statuses[-1]["state"] == "failed")
+            patch.undo()
+            eventually(lambda: one.saw("active", version=2))
+
+
 # --- the disk ---
 
 
@@ -554,6 +572,23 @@ def test_a_file_system_without_locks_is_no_other_agent(
     monkeypatch.setattr(fcntl, "flock", refuse)
     with pytest.raises(Invalid, match=r"cannot be locked \(No locks available\)"):
         robot().once()
+
+
+def test_what_is_damaged_while_it_runs_is_told_and_healed(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    one = robot(f"cat $FLEETMAP_CURRENT/kml/map.kml > {tmp_path}/taken")
+    one.agent.open()
+    assert one.agent.once()
+    path = one.into / "current" / "kml" / "map.kml"
+    path.chmod(0o644)
+    path.write_bytes(b"x" * 5000)
+    (tmp_path / "taken").unlink()
+    fake.more = {"expires": "2999-01-01T00:00:00Z"}  # the next signature over the same map
+    fake.instead = lambda h: bool(h.headers.__delitem__("if-none-match"))
+    assert one.agent.once()
+    one.agent.close()
+    assert one.saw("damaged", version=1, files=["kml/map.kml"])
+    assert whole(one.into)["version"] == 1
+    assert (tmp_path / "taken").read_bytes() == A["kml/map.kml"]
 
 
 def test_what_lies_ready_is_looked_at_again(fake: Fake, robot: Robot) -> None:
