@@ -21,8 +21,8 @@ LOOK_SECONDS = 0.004
 """How often the host's generation number is looked at: a read of shared memory."""
 
 PAGE = 500
-REPLAYED_ENVIRONMENTS = 250
-"""At a start the last events of so many environments fill the publishers' caches again."""
+REPLAYED = 20_000
+"""At a start so many events fill the publishers' caches again: where environments are many, the last ones of each."""
 
 NAME = "events"
 
@@ -72,7 +72,9 @@ class Relay(Single):
     def _replay(self) -> None:
         """A new session's caches are empty: put the last events of each environment again, oldest first."""
         position = self._store.relayed()
-        for event in self._store.last_events(position, HISTORY, REPLAYED_ENVIRONMENTS):
+        for event in self._store.last_events(position, HISTORY, REPLAYED):
+            if self._ending.is_set():
+                return
             self._publish(event)
 
     def _publish(self, event: Event) -> None:

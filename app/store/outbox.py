@@ -145,21 +145,30 @@ class Outbox(Base):
             elif known < position:
                 connection.execute(update(table).where(table.c.id == 1).values(position=position))
 
-    def last_events(self, position: int, each: int, environments: int) -> list[Event]:
-        """The last ``each`` events up to a position of the environments changed last, in the order of the log."""
+    def last_events(self, position: int, each: int, most: int) -> list[Event]:
+        """The last ``each`` events up to a position of all environments, in the order of the log.
+
+        Where those are more than ``most``, each environment has fewer; where not even the last one of each fits, the
+        environments that were silent longest have none.
+        """
         table, owner = tables.event, tables.environment
-        newest = select(owner.c.id).order_by(owner.c.updated.desc(), owner.c.id).limit(environments)
         rank = func.row_number().over(partition_by=table.c.environment_id, order_by=table.c.sequence.desc())
         recent = (
-            select(table, rank.label("rank"))
+            select(table.c.position, rank.label("rank"))
             .where(
                 table.c.position <= position,
                 table.c.position > position - REACH,
-                table.c.environment_id.in_(newest.scalar_subquery()),
+                table.c.environment_id.in_(select(owner.c.id)),
             )
             .subquery()
         )
-        query = select(recent).where(recent.c.rank <= each).order_by(recent.c.position)
+        chosen = (
+            select(recent.c.position)
+            .where(recent.c.rank <= each)
+            .order_by(recent.c.rank, recent.c.position.desc())
+            .limit(most)
+        )
+        query = select(table).where(table.c.position.in_(chosen)).order_by(table.c.position)
         with self._database.read() as connection:
             rows = connection.execute(query).all()
         return [Event(r.sequence, r.environment, r.body, r.time, r.position) for r in rows]

@@ -241,6 +241,29 @@ def test_a_renamed_environment_keeps_its_history(store: Store):
         store.update_environment("farm", new_name="NO")
 
 
+def test_the_last_events_of_all_environments(store: Store):
+    for name, moves in (("busy", 5), ("calm", 1), ("gone", 1), ("moved", 2)):
+        store.create_environment(name)
+        for k in range(moves):
+            store.set_channel(name, f"c{k}", 0, author="ann")
+    store.delete_environment("gone")
+    store.purge_environment("gone")
+    store.update_environment("moved", new_name="here")
+    end = store.last_position()
+
+    def last(each: int, most: int, position: int = end) -> list[tuple[str, int]]:
+        found = store.last_events(position, each, most)
+        assert [e.position for e in found] == sorted(e.position for e in found)
+        return [(e.environment, e.sequence) for e in found]
+
+    calm, moved = [("calm", 1), ("calm", 2)], [("moved", 1), ("moved", 2), ("moved", 3), ("moved", 4), ("here", 5)]
+    assert last(9, 99) == [*[("busy", n) for n in range(1, 7)], *calm, *moved]
+    assert last(2, 99) == [("busy", 5), ("busy", 6), *calm, *moved[-2:]]
+    assert last(9, 7) == [("busy", 5), ("busy", 6), *calm, *moved[-3:]], "each has its last ones"
+    assert last(9, 2) == [("calm", 2), ("here", 5)], "the one that was silent longest has none"
+    assert last(9, 99, position=2) == [("busy", 1), ("busy", 2)]
+
+
 def test_events_tell_what_the_contract_says(store: Store):
     store.create_environment("farm", author="ann", datum=DATUM)
     made = save(store, "farm", Replace(GRID, grid()), Replace(TOPOLOGY, network(5)))
