@@ -149,8 +149,7 @@ def test_other_sizes_lose_no_obstacle(shared: Path, size: float) -> None:
     rank = {FREE: 0, UNKNOWN: 1, OCCUPIED: 2}
     dice = np.random.default_rng(3)
     x0, y0 = (round(v / 0.08) for v in fine.origin[:2])
-    for _ in range(300):
-        row, column = int(dice.integers(grid.height)), int(dice.integers(grid.width))
+    for row, column in {(int(dice.integers(grid.height)), int(dice.integers(grid.width))) for _ in range(300)}:
         if size >= 0.08:
             spans = []
             for k, first, sides in ((column, grid.origin[0], fine.width), (row, grid.origin[1], fine.height)):
