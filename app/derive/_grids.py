@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from app.derive._choice import named, one_each
 from app.derive.occupancy_to_voxels import MASKS
-from app.errors import Ambiguous, MissingLayer, NotFound
+from app.errors import MissingLayer
 from app.model import masks
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
@@ -16,23 +17,11 @@ def chosen(layers: Layers, name: str | None, what: str) -> dict[PartKey, Occupan
     """
     grids = layers.grids()
     if name is not None:
-        found = {k: g for k, g in grids.items() if k.name == name}
-        if not found:
-            there = ", ".join(sorted({k.name for k in grids})) or "none"
-            raise NotFound(f"there is no occupancy grid {name!r}; there are: {there}")
-        return found
-    out = {}
+        return named(grids, name, "occupancy grid")
     maps = {k: g for k, g in grids.items() if k.name not in MASKS and masks.NAME not in g.properties}
     if not maps:
         raise MissingLayer(f"costmap filter masks alone tell no {what}: upload an occupancy grid of what stands there")
-    for level in dict.fromkeys(k.level for k in maps):
-        here = {k: g for k, g in maps.items() if k.level == level}
-        plain = {k: g for k, g in here.items() if k.name == MAP} or here
-        if len(plain) > 1:
-            there = ", ".join(k.name for k in plain)
-            raise Ambiguous(f"level {level!r} has several occupancy grids ({there}): name one with grid=")
-        out.update(plain)
-    return out
+    return one_each(maps, MAP, "occupancy grid", "grid")
 
 
 def called(key: PartKey) -> str:

@@ -26,6 +26,12 @@ _DX = np.array([0, 1, 1, 1, 0, -1, -1, -1], np.int64)
 """The eight neighbours, clockwise from the row above: bit k of a neighbourhood's code stands for neighbour k."""
 
 
+def pieces(code: int) -> int:
+    """Yokoi's number of a neighbourhood: how many 8-connected pieces the neighbours fall into without its cell."""
+    q = [1 - (code >> k & 1) for k in range(8)]
+    return sum(q[k] - q[k] * q[(k + 1) % 8] * q[(k + 2) % 8] for k in (0, 2, 4, 6))
+
+
 def _tables() -> tuple[U8, U8]:
     """By code of a neighbourhood: bit 1 and 2 whether the first and second pass delete; whether a cell is redundant."""
     passes, redundant = np.zeros(256, np.uint8), np.zeros(256, np.uint8)
@@ -38,16 +44,48 @@ def _tables() -> tuple[U8, U8]:
                 passes[code] |= 1
             if not (north and east and west) and not (north and south and west):
                 passes[code] |= 2
-        # Yokoi's number: how many 8-connected pieces the neighbours would fall into; an end (one neighbour) stays.
-        q = [1 - v for v in p]
-        pieces = sum(q[k] - q[k] * q[(k + 1) % 8] * q[(k + 2) % 8] for k in (0, 2, 4, 6))
-        redundant[code] = sum(p) >= 2 and pieces == 1
+        redundant[code] = sum(p) >= 2 and pieces(code) == 1  # an end (one neighbour) stays
     return passes, redundant
 
 
 _PASSES, _REDUNDANT = _tables()
 _BLOCK = 4 | 8 | 16
 """The neighbourhood of the upper left cell of a 2 × 2 block: east, south-east and south."""
+
+
+@native
+def steps(width: int) -> I64:
+    """From a cell to its eight neighbours, in a flat mask of this width."""
+    out = np.empty(8, np.int64)
+    for k in range(8):
+        out[k] = _DY[k] * width + _DX[k]
+    return out
+
+
+@native
+def slim(flat: U8, step: I64, cells: I32, count: int) -> int:
+    """Take away cells that can go without cutting anything, until there is none; how many are left.
+
+    flat: of zeros and ones, one where a cell is; step: to its neighbours; cells: the first ``count`` of them are looked
+    at, and those that stay are moved to its beginning.
+    """
+    again = True
+    while again:
+        again = False
+        n = 0
+        for i in range(count):
+            cell = cells[i]
+            code = 0
+            for k in range(8):
+                code |= flat[cell + step[k]] << k
+            if _REDUNDANT[code]:
+                flat[cell] = 0
+                again = True
+            else:
+                cells[n] = cell
+                n += 1
+        count = n
+    return count
 
 
 @native
@@ -88,9 +126,7 @@ def thin(mask: U8) -> int:
                 n1 += 1
                 n2 += 1
                 mask[y, x] |= 6
-    step = np.empty(8, np.int64)
-    for k in range(8):
-        step[k] = _DY[k] * width + _DX[k]
+    step = steps(width)
     bit = 1
     while n1 > 0 or n2 > 0:
         deleted = 0
@@ -133,7 +169,7 @@ def thin(mask: U8) -> int:
         if n1 > len(gone):
             gone = np.empty(len(first), np.int32)
         bit = 3 - bit
-    # What is left of steps: cells that can go without cutting anything, until there is none.
+    # What is left of corners.
     left = np.empty(count, np.int32)
     n = 0
     for cell in range(len(flat)):
@@ -141,23 +177,7 @@ def thin(mask: U8) -> int:
             flat[cell] = 1
             left[n] = cell
             n += 1
-    again = True
-    while again:
-        again = False
-        n = 0
-        for i in range(count):
-            cell = left[i]
-            code = 0
-            for k in range(8):
-                code |= flat[cell + step[k]] << k
-            if _REDUNDANT[code]:
-                flat[cell] = 0
-                again = True
-            else:
-                left[n] = cell
-                n += 1
-        count = n
-    return count
+    return slim(flat, step, left, count)
 
 
 @native

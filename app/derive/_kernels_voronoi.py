@@ -15,21 +15,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.derive._kernels_skeleton import _DX, _DY, _REDUNDANT
+from app.derive._kernels_skeleton import pieces, slim, steps
 from app.derive._kernels_space import F64, I32, I64, U8, U16, gaps
 from app.derive._native import native
 
-
-def _simple() -> U8:
-    """By code of a neighbourhood (``_kernels_skeleton``): whether a cell can go without changing pieces or holes."""
-    out = np.zeros(256, np.uint8)
-    for code in range(256):
-        q = [1 - (code >> k & 1) for k in range(8)]
-        out[code] = sum(q[k] - q[k] * q[(k + 1) % 8] * q[(k + 2) % 8] for k in (0, 2, 4, 6)) == 1  # Yokoi's number
-    return out
-
-
-_SIMPLE = _simple()
+_SIMPLE = np.array([pieces(code) == 1 for code in range(256)], np.uint8)
+"""By code of a neighbourhood (``_kernels_skeleton``): whether a cell can go without changing pieces or holes."""
 
 OPPOSITE = 1.6
 """Obstacles that are this many times as far from each other as from a cell lie on opposite sides: 106 degrees as seen
@@ -170,11 +161,8 @@ def sorted_band(mask: U8, rank: U16, low: int, high: int, place: I64, out: I32) 
 def thin(mask: U8, order: I32, rank: U16) -> None:
     """Take cells of a mask away in this order (places in the flat mask, nearest to obstacles first). Bit 1 marks
     anchors, which stay."""
-    width = mask.shape[1]
     flat, key = mask.ravel(), rank.ravel()
-    step = np.empty(8, np.int64)
-    for k in range(8):
-        step[k] = _DY[k] * width + _DX[k]
+    step = steps(mask.shape[1])
     stack = np.empty(1024, np.int64)
     for i in range(len(order)):
         size = 1
@@ -210,31 +198,10 @@ def finish(mask: U8, order: I32) -> int:
     Anchors may be two cells wide: those go that are no ends. order: the cells that are left, as for ``thin``; it is
     used up.
     """
-    width = mask.shape[1]
     flat = mask.ravel()
-    step = np.empty(8, np.int64)
-    for k in range(8):
-        step[k] = _DY[k] * width + _DX[k]
-    count = len(order)
-    for i in range(count):
+    for i in range(len(order)):
         flat[order[i]] = 1
-    again = True
-    while again:
-        again = False
-        n = 0
-        for i in range(count):
-            cell = order[i]
-            code = 0
-            for k in range(8):
-                code |= flat[cell + step[k]] << k
-            if _REDUNDANT[code]:
-                flat[cell] = 0
-                again = True
-            else:
-                order[n] = cell
-                n += 1
-        count = n
-    return count
+    return slim(flat, steps(mask.shape[1]), order, len(order))
 
 
 def compile_all() -> None:

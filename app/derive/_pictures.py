@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import Notes
-from app.errors import Ambiguous, CannotConvert, Invalid, NotFound
+from app.derive._choice import named, one_each
+from app.errors import CannotConvert, Invalid
 from app.model.frame import Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
 from app.model.imagery import CLEAR, LOCAL, Picture, displayed
@@ -64,20 +65,8 @@ def chosen(layers: Layers, name: str | None) -> dict[PartKey, Picture]:
     """One picture for each level: the named one, else ``satellite``, else the only one. NotFound, or Ambiguous."""
     pictures = {key: part for key, part in layers.of("imagery").items() if isinstance(part, Picture)}
     if name is not None:
-        found = {key: part for key, part in pictures.items() if key.name == name}
-        if not found:
-            there = ", ".join(sorted({key.name for key in pictures})) or "none"
-            raise NotFound(f"there is no picture {name!r}; there are: {there}")
-        return found
-    out = {}
-    for level in dict.fromkeys(key.level for key in pictures):
-        here = {key: part for key, part in pictures.items() if key.level == level}
-        usual = {key: part for key, part in here.items() if key.name == SATELLITE} or here
-        if len(usual) > 1:
-            there = ", ".join(key.name for key in usual)
-            raise Ambiguous(f"level {level!r} has several pictures ({there}): name one with picture=")
-        out.update(usual)
-    return out
+        return named(pictures, name, "picture")
+    return one_each(pictures, SATELLITE, "picture", "picture")
 
 
 def called(key: PartKey) -> str:

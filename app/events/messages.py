@@ -1,4 +1,7 @@
-"""What is said over Zenoh: keys and payloads. The robot's side imports nothing of the server but this and errors."""
+"""What is said over Zenoh: keys and payloads.
+
+The robot's side imports nothing of the server but this, and what errors and event types are.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from app.errors import Invalid, Problem
+from app.event_types import EVENT_TYPES, EventType
 
 PREFIX = "fleetmap"
 """The usual start of every key."""
@@ -17,20 +21,6 @@ JSON = "application/json"
 
 SIGNATURE = "fleetmap-signature"
 """Header of a manifest: ``<key id>:<base64 of the Ed25519 signature over the body>``."""
-
-EventType = Literal[
-    "version.created",
-    "channel.planned",
-    "channel.moved",
-    "environment.created",
-    "environment.deleted",
-    "overlay.created",
-    "overlay.accepted",
-    "overlay.rejected",
-    "overlay.expired",
-    "overlay.ended",
-]
-EVENT_TYPES: tuple[EventType, ...] = get_args(EventType)
 
 RobotState = Literal["downloading", "ready", "active", "failed"]
 ROBOT_STATES: tuple[RobotState, ...] = get_args(RobotState)

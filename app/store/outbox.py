@@ -4,30 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any
 
 from sqlalchemy import Connection, func, insert, select, update
 
 from app.errors import NotFound
+from app.event_types import EventType
 from app.store import tables
 from app.store.base import Base, environment_row
 from app.store.values import Event, PartEntry, rfc3339
 
 REACH = 100_000
 """So far back in the log the last events of environments, and of names that are gone, are looked for."""
-
-EventType = Literal[
-    "version.created",
-    "channel.planned",
-    "channel.moved",
-    "environment.created",
-    "environment.deleted",
-    "overlay.created",
-    "overlay.accepted",
-    "overlay.rejected",
-    "overlay.expired",
-    "overlay.ended",
-]
 
 
 def layer_changes(before: Sequence[PartEntry], after: Sequence[PartEntry]) -> list[dict[str, Any]]:

@@ -15,6 +15,7 @@ from typing import Any, Final
 from sqlalchemy import Connection, Row, func, insert, or_, select, update
 
 from app.errors import Conflict, NotFound
+from app.event_types import EventType
 from app.store import outbox, tables
 from app.store.base import Base, environment_row, text, utcnow
 from app.store.values import Overlay, OverlayState
@@ -26,7 +27,7 @@ MAX_OF_ONE: Final = 100
 """So many of them may one reporter have: one that goes wild leaves room for the others."""
 
 MAX_LISTED: Final = 10_000
-TOLD: Final[Mapping[OverlayState, outbox.EventType]] = {"rejected": "overlay.rejected", "ended": "overlay.ended"}
+TOLD: Final[Mapping[OverlayState, EventType]] = {"rejected": "overlay.rejected", "ended": "overlay.ended"}
 """What deciding tells. An acceptance is told once its version is known."""
 
 LOST_AFTER: Final = timedelta(seconds=60)
@@ -160,7 +161,7 @@ class Overlays(Base):
 
 
 def _tell(
-    connection: Connection, environment: Row[Any], overlay: Overlay, kind: outbox.EventType, author: str, now: datetime
+    connection: Connection, environment: Row[Any], overlay: Overlay, kind: EventType, author: str, now: datetime
 ) -> None:
     """The event of one step. version and root are the head's; the environment's row is locked and as it is stored."""
     sequence = environment.sequence + 1
