@@ -105,7 +105,7 @@ class Agent:
 
     def __init__(self, options: Options, tell: Tell, clock: Callable[[], float] = time.time) -> None:
         if options.key is not None:
-            trust.check_given(options.key)
+            options = dataclasses.replace(options, key=trust.check_given(options.key))
         self.options, self._tell, self._clock = options, tell, clock
         self._robot = robot_name(options.robot)
         self._login = options.zenoh_login

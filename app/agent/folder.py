@@ -335,5 +335,5 @@ def environment_sh(manifest: Manifest, current: Path) -> str:
     }
     lines = [f"export {name}={shlex.quote(value)}" for name, value in values.items()]
     if models:
-        lines.append('export GAZEBO_MODEL_PATH="${GAZEBO_MODEL_PATH:-}:$GAZEBO_CUSTOM_MODELS"')
+        lines.append('export GAZEBO_MODEL_PATH="${GAZEBO_MODEL_PATH:+$GAZEBO_MODEL_PATH:}$GAZEBO_CUSTOM_MODELS"')
     return "# Written by `fleetmap agent` with each version; to be sourced.\n" + "\n".join(lines) + "\n"

@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import socket
+import ssl
 import sys
 import threading
 import time
@@ -86,12 +87,18 @@ class Web:
             headers=headers,
             timeout=TIMEOUT,
             follow_redirects=False,
-            verify=True if ca is None else trusting(ca),
+            verify=self._trust(ca),
         )
         self._stopping = stopping
         self._sockets: list[socket.socket] = []
         self.received = 0
         self.deltas = 0
+
+    def _trust(self, ca: Path | None) -> ssl.SSLContext | bool:
+        if ca is not None:
+            return trusting(ca)
+        # Over plain HTTP nobody's certificate is believed: no authorities are read for that.
+        return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT) if self.server.startswith("http://") else True
 
     def close(self) -> None:
         """Let go of the connections."""
@@ -117,7 +124,9 @@ class Web:
     def channels(self, environment: str) -> list[Mapping[str, Any]]:
         """The channels with what is planned for them, without how the fleet stands."""
         found = self._json(f"{API}/environments/{quote(environment, safe='')}/channels?robots=false")
-        return [line for line in found if isinstance(line, dict)] if isinstance(found, list) else []
+        if not isinstance(found, list):
+            raise Unavailable(f"{self.server} does not answer as a Fleet Map Server: these are no channels")
+        return [line for line in found if isinstance(line, dict)]
 
     def manifest(
         self, environment: str, ref: str, formats: Iterable[str], etag: str | None = None

@@ -278,7 +278,7 @@ def test_the_key_can_be_given(api: Api, place: str, robot: Start, gate: Gate) ->
     attacked(robot, gate, key="0" * 16, word="does not vouch", holds=None)
     other = base64.b64encode(bytes(range(32))).decode()
     attacked(robot, gate, key=other, word="does not vouch", holds=None)
-    assert robot(key=told["id"], name="by-id").good
+    assert robot(key=f" {told['id']}\n", name="by-id").good
     assert robot(key=told["public_key"], name="by-key").good
     with pytest.raises(Untrusted, match="--key takes"):
         robot(key="nonsense", name="wrong")

@@ -145,10 +145,11 @@ def test_not_modified_is_not_asked_of_a_map_that_does_not_stand(fake: Fake, robo
 def test_where_the_channels_are_not_told_latest_is_not_guessed(fake: Fake, robot: Robot) -> None:
     fake.move("production", 1)
     fake.put(B)
-    fake.instead = lambda h: "/channels" in h.path and (send(h, 400, b"{}") or True)
-    one = robot()
-    assert not one.once()
-    assert not (one.into / "current").exists(), "latest may be what nobody has tried yet"
+    for status in (400, 404, 200, 301):
+        fake.instead = lambda h, s=status: "/channels" in h.path and (send(h, s, b"{}") or True)
+        one = robot()
+        assert not one.once()
+        assert not (one.into / "current").exists(), "latest may be what nobody has tried yet"
     fake.instead = lambda _: False
     assert robot().once()
     assert whole(one.into)["version"] == 1
@@ -212,6 +213,17 @@ def test_what_is_planned_is_what_is_preloaded(fake: Fake, robot: Robot) -> None:
     again = robot()
     assert again.once()
     assert again.saw("ready", version=2)
+
+
+def test_models_are_found_by_gazebo(fake: Fake, robot: Robot) -> None:
+    fake.put({"gazebo/world.sdf": b"w", "gazebo/models/shelf/model.sdf": b"m"})
+    one = robot(formats=("gazebo",))
+    assert one.once()
+    script = 'set -eu; . "$1"; printf "%s\n" "$GAZEBO_MODEL_PATH"; . "$1"; printf "%s\n" "$GAZEBO_MODEL_PATH"'
+    command = ["env", "-u", "GAZEBO_MODEL_PATH", "sh", "-c", script, "sh", one.into / "current" / "environment.sh"]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    models = str(one.into / "current" / "gazebo" / "models")
+    assert told == [models, f"{models}:{models}"], "no empty place in it, which would be wherever one is"
 
 
 def test_a_moved_folder_has_its_paths_put_right(fake: Fake, robot: Robot, tmp_path: Path) -> None:
