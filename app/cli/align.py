@@ -28,12 +28,7 @@ def align(
         list[str] | None,
         typer.Option("--pair", metavar="X,Y=X,Y", help="A point where it is, and where it should be, m; repeatable."),
     ] = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--option", "-O", metavar="NAME=VALUE", help="Of the slice of objects or voxels (height …); repeatable."
-        ),
-    ] = None,
+    option: Annotated[list[str] | None, options.named_values("Of the slice of objects or voxels (height …)")] = None,
     angle: Annotated[float, typer.Option("--angle", min=0, max=180, help="The largest turn that is tried, °.")] = 180.0,
     reach: Annotated[
         float | None, typer.Option("--reach", min=0, help="The farthest that the grid's middle may go, m.")

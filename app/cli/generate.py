@@ -10,7 +10,7 @@ import typer
 from app.cli import options, output, write
 from app.cli.client import Client, Refused, path_of
 from app.cli.folder import check_name, environment_name
-from app.cli.history import summary
+from app.cli.history import show_made
 from app.cli.maps import show_report
 from app.errors import Invalid
 
@@ -26,17 +26,14 @@ def generate(
     environment: Annotated[
         str | None, typer.Option("--environment", "-e", help="Where to keep it [default: SITE-SEED, made if absent].")
     ] = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option("--option", "-O", metavar="NAME=VALUE", help="A parameter of the generator; repeatable."),
-    ] = None,
+    option: Annotated[list[str] | None, options.named_values("A parameter of the generator")] = None,
     datum: options.DatumText = None,
     to: Annotated[
         str | None, typer.Option("--to", help="Write a map in this format instead; needs no server, keeps nothing.")
     ] = None,
     out: options.Output = None,
     message: options.Message = "",
-    replace: Annotated[bool, typer.Option("--replace", help="Also in place of what a source has told.")] = False,
+    replace: options.Replace = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
@@ -59,11 +56,7 @@ def generate(
         with Client(server, token) as client, output.progress_bar(f"generating {site}"):
             _ensure(client, name, place)
             made = client.post(path_of("environments", name, "generations"), body, repeat=True)
-        if as_json:
-            output.show_json(made)
-            return
-        output.show(f"{name}: version {made['version']}: {summary(made.get('changes') or {}) or 'nothing new'}")
-        output.show_warnings(made.get("warnings") or ())
+        show_made(name, made, as_json=as_json)
         return
     if out is None:
         raise typer.BadParameter("--to needs -o: a file, a folder, or - for standard output")

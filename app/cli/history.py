@@ -255,12 +255,9 @@ def _datum(datum: Any) -> str:
 def derive(
     environment: Annotated[str | None, typer.Argument(help="Name of the environment [default: list methods].")] = None,
     method: Annotated[str | None, typer.Argument(help="The derivation, such as occupancy_to_topology.")] = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option("--option", "-O", metavar="NAME=VALUE", help="A parameter of the derivation; repeatable."),
-    ] = None,
+    option: Annotated[list[str] | None, options.named_values("A parameter of the derivation")] = None,
     message: options.Message = "",
-    replace: Annotated[bool, typer.Option("--replace", help="Also in place of what a source has told.")] = False,
+    replace: options.Replace = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
@@ -287,6 +284,11 @@ def derive(
     body = {"method": method, "parameters": options.pairs(option), "message": message, "replace": replace}
     with Client(server, token) as client, output.progress_bar(f"deriving by {method}"):
         made = client.post(path_of("environments", environment, "derivations"), body, repeat=True)
+    show_made(environment, made, as_json=as_json)
+
+
+def show_made(environment: str, made: Mapping[str, Any], *, as_json: bool) -> None:
+    """A version that a derivation or a generator has made, or that is as it was."""
     if as_json:
         output.show_json(made)
         return

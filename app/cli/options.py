@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from app.errors import Invalid
 from app.model.frame import Datum
 
+
+def named_values(help: str) -> Any:
+    """The option -O NAME=VALUE, which ``pairs`` reads."""
+    return typer.Option("--option", "-O", metavar="NAME=VALUE", help=f"{help}; repeatable.")
+
+
+Options = Annotated[list[str] | None, named_values("A parameter of the format")]
 Server = Annotated[
     str | None,
     typer.Option(
@@ -21,10 +28,7 @@ Token = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
 Version = Annotated[str, typer.Option("--version", "-V", help="Version number, channel, or latest.")]
 Message = Annotated[str, typer.Option("--message", "-m", help="Why, for the history.")]
-Options = Annotated[
-    list[str] | None,
-    typer.Option("--option", "-O", metavar="NAME=VALUE", help="A parameter of the format; repeatable."),
-]
+Replace = Annotated[bool, typer.Option("--replace", help="Also in place of what a source has told.")]
 Format = Annotated[
     str | None, typer.Option("--format", "-f", help="Format of the files [default: found out from the content].")
 ]

@@ -19,10 +19,7 @@ def template(
     chosen: Annotated[
         str | None, typer.Option("--set", metavar="NAME", help="The set that holds: of the environment, or the format.")
     ] = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option("--option", "-O", metavar="NAME=VALUE", help="A value of the format's parameter; repeatable."),
-    ] = None,
+    option: Annotated[list[str] | None, options.named_values("A value of the format's parameter")] = None,
     unset: Annotated[
         bool, typer.Option("--unset", help="Take back what was said; with -O NAME only this parameter.")
     ] = False,

@@ -170,6 +170,18 @@ def classes(model: Supplied, session: Any) -> tuple[tuple[str | None, ...], Mapp
     return kinds, more
 
 
+def one_picture(model: Supplied, file: Loaded, told: str, usual: int) -> int:
+    """The side of the one picture [1, 3, h, w] that a model takes. told: of a model that takes something else, for the
+    error. CannotConvert says what it should take."""
+    (kind, shape), *more = file.inputs.values()
+    if more or kind != "tensor(float)" or len(shape) != 4 or shape[1] not in (3, "3"):
+        raise CannotConvert(
+            f"the model {model.name} {told}: its input is not one picture [1, 3, h, w] of floats; it is "
+            f"{file.signature()}"
+        )
+    return square(shape[2:], model.name, usual)
+
+
 def square(shape: Iterable[int | str | None], name: str, usual: int) -> int:
     """The side of the pictures that a model takes, of its height and width. usual: where it takes any."""
     sizes = [n for n in shape if isinstance(n, int)]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import Notes
-from app.derive._onnx import Array, Loaded, Supplied, classes, square, starts
+from app.derive._onnx import Array, Loaded, Supplied, classes, one_picture, starts
 from app.derive._pictures import Ground
 from app.derive._segments import Region, Segments, way
 from app.errors import CannotConvert
@@ -47,14 +47,8 @@ class Model:
 
 def model_of(supplied: Supplied, file: Loaded) -> Model:
     """A loaded file as a model that tells pixels. CannotConvert says what it should take."""
-    (kind, shape), *more = file.inputs.values()
-    if more or kind != "tensor(float)" or len(shape) != 4 or shape[1] not in (3, "3"):
-        raise CannotConvert(
-            f"the model {supplied.name} tells no pixels: its input is not one picture [1, 3, h, w] of floats; it is "
-            f"{file.signature()}"
-        )
+    side = one_picture(supplied, file, "tells no pixels", SIDE)
     kinds, said = classes(supplied, file.session)
-    side = square(shape[2:], supplied.name, SIDE)
     mean, deviation = (_three(said, word, usual, supplied) for word, usual in (("mean", MEAN), ("std", DEVIATION)))
     if (deviation <= 0).any():
         raise CannotConvert(f"{supplied.words.name}: std must be above 0")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import Notes
-from app.derive._onnx import Array, Loaded, Supplied, classes, square, starts
+from app.derive._onnx import Array, Loaded, Supplied, classes, one_picture, starts
 from app.derive._pictures import Ground
 from app.derive._segments import Region, Segments, way
 from app.errors import CannotConvert
@@ -54,13 +54,7 @@ class Model:
 
 def model_of(supplied: Supplied, file: Loaded) -> Model:
     """A loaded file as a model of the family. CannotConvert says what it should take."""
-    (kind, shape), *more = file.inputs.values()
-    if more or kind != "tensor(float)" or len(shape) != 4 or shape[1] not in (3, "3"):
-        raise CannotConvert(
-            f"the model {supplied.name} is not of the YOLO family: its input is not one picture [1, 3, h, w] of "
-            f"floats; it is {file.signature()}"
-        )
-    side = square(shape[2:], supplied.name, SIDE)
+    side = one_picture(supplied, file, "is not of the YOLO family", SIDE)
     return Model(file, supplied.name, classes(supplied, file.session)[0], side)
 
 

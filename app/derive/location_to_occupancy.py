@@ -8,24 +8,17 @@ import shapely
 
 from app.derive import Notes, derives
 from app.derive._obstacles import fences
-from app.derive.objects_to_occupancy import RESOLUTION, blank, framed
+from app.derive.objects_to_occupancy import blank, cell_size, framed
 from app.errors import MissingLayer
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, Layers, Part, PartKey
-from app.parameters import parameter
 
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
     """How fine."""
 
-    resolution: float | None = parameter(
-        None,
-        f"metres a cell; default: {RESOLUTION}, or as much coarser as keeps a grid below 2^25 cells",
-        minimum=1e-3,
-        maximum=100.0,
-        unit="m",
-    )
+    resolution: float | None = cell_size()
 
 
 @derives(gives="occupancy", needs={"location"}, parameters=Parameters, cost=50.0, last=True)

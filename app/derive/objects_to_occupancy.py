@@ -37,6 +37,12 @@ LONGEST = 32767
 """Cells along a side: beyond it Nav2's map_server refuses the map."""
 
 
+def cell_size() -> Any:
+    """The parameter ``resolution`` of the grids that are drawn."""
+    text = f"metres a cell; default: {RESOLUTION}, or as much coarser as keeps a grid below 2^25 cells"
+    return parameter(None, text, minimum=1e-3, maximum=100.0, unit="m")
+
+
 @dataclass(frozen=True, slots=True)
 class Parameters:
     """At which height, how fine, and how much is added around."""
@@ -55,13 +61,7 @@ class Parameters:
         maximum=1e4,
         unit="m",
     )
-    resolution: float | None = parameter(
-        None,
-        f"metres a cell; default: {RESOLUTION}, or as much coarser as keeps a grid below 2^25 cells",
-        minimum=1e-3,
-        maximum=100.0,
-        unit="m",
-    )
+    resolution: float | None = cell_size()
     inflate: float = parameter(0.0, "how far obstacles are grown", minimum=0.0, maximum=100.0, unit="m")
     padding: float = parameter(
         1.0, "free space around everything, where no fence says how far the site reaches", minimum=0.0, maximum=1000.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from app.derive import Notes, _raster, derives
 from app.derive._obstacles import Site, fence_of, fences, sites
-from app.derive.objects_to_occupancy import HEIGHT, RESOLUTION, blank, framed
+from app.derive.objects_to_occupancy import HEIGHT, blank, cell_size, framed
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer
 from app.model.features import Features, Properties
 from app.model.frame import GROUND
@@ -52,13 +52,7 @@ class Parameters:
         maximum=WIDEST,
         unit="m",
     )
-    resolution: float | None = parameter(
-        None,
-        f"metres a cell; default: {RESOLUTION}, or as much coarser as keeps a grid below 2^25 cells",
-        minimum=1e-3,
-        maximum=100.0,
-        unit="m",
-    )
+    resolution: float | None = cell_size()
     stairs: bool = parameter(False, "whether edges over stairs are free ground")
     obstacles: bool = parameter(True, "whether stored objects that stand in a robot's way are drawn as occupied")
 

@@ -18,7 +18,7 @@ import shapely
 from lxml import etree
 from numpy.typing import NDArray
 
-from app.formats import WriteContext, _image, _text
+from app.formats import Needs, WriteContext, _image, _text
 from app.formats._kml import (
     COORDINATES,
     END,
@@ -52,6 +52,18 @@ _NAMESPACES = f'xmlns="{KML}" xmlns:gx="{GX}" xmlns:kml="{KML}" xmlns:atom="{ATO
 _SAME_PLACE = 1e-10
 """Degrees: a geometry that differs less from what the kept element says has not been edited (coordinates are printed
 to 1e-12)."""
+
+NEEDS = Needs(
+    (
+        frozenset({"objects"}),
+        frozenset({"topology"}),
+        frozenset({"location"}),
+        frozenset({"zones"}),
+        frozenset({"occupancy"}),
+    ),
+    anchor="wgs84",
+)
+"""What ``write_kml`` can draw: any of these layers."""
 
 _COLOURS = {
     "node": "<IconStyle><color>ff00a5ff</color><scale>0.6</scale><Icon><href>"

@@ -7,10 +7,10 @@ Source: OGC 12-007r2 (KML 2.3), Google's ``gx`` extension.
 
 from __future__ import annotations
 
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _kml_rules, register
+from app.formats import Files, Format, ReadContext, WriteContext, _kml_rules, register
 from app.formats._archive import is_archive
 from app.formats._kml import FAMILY, MAIN, read_kml
-from app.formats._kml_writing import write_kml
+from app.formats._kml_writing import NEEDS, write_kml
 from app.model.layers import Layers
 
 _HEADS = (b"<kml", b":kml", b"opengis.net/kml", b"earth.google.com/kml")
@@ -50,16 +50,7 @@ register(
         read=read,
         check=_kml_rules.check,
         write=write,
-        needs=Needs(
-            (
-                frozenset({"objects"}),
-                frozenset({"topology"}),
-                frozenset({"location"}),
-                frozenset({"zones"}),
-                frozenset({"occupancy"}),
-            ),
-            anchor="wgs84",
-        ),
+        needs=NEEDS,
         family=FAMILY,
         drawing=True,
         outlines=True,

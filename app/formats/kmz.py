@@ -7,10 +7,10 @@ takes it; every other entry is kept byte for byte. Grids travel here with their 
 from __future__ import annotations
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _kml_rules, register
+from app.formats import Files, Format, ReadContext, WriteContext, _kml_rules, register
 from app.formats import _archive as archive
 from app.formats._kml import FAMILY, read_kml
-from app.formats._kml_writing import write_kml
+from app.formats._kml_writing import NEEDS, write_kml
 from app.model.layers import Layers, Part, PartKey, Resources
 
 MAIN = "map.kmz"
@@ -80,16 +80,7 @@ register(
         read=read,
         check=_kml_rules.check_archive,
         write=write,
-        needs=Needs(
-            (
-                frozenset({"objects"}),
-                frozenset({"topology"}),
-                frozenset({"location"}),
-                frozenset({"zones"}),
-                frozenset({"occupancy"}),
-            ),
-            anchor="wgs84",
-        ),
+        needs=NEEDS,
         family=FAMILY,
         drawing=True,
         rank=11,
