@@ -9,6 +9,7 @@ import logging
 import queue
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -24,6 +25,9 @@ log = logging.getLogger(__name__)
 
 WAITING = 20_000
 """So many reports wait for the database; of further ones it is told that they were left out."""
+
+SHARE = 200
+"""Of one robot so many wait, of those that came over the bus: who says too much displaces nobody else."""
 
 BATCH = 100
 """Reports in one transaction: a quarter of a second on SQLite, in which nobody else can write."""
@@ -58,6 +62,7 @@ class Intake:
     def __init__(self, store: Store, clock: Callable[[], datetime] = lambda: datetime.now(UTC)) -> None:
         self._store, self._clock = store, clock
         self._queue: queue.Queue[tuple[str, str, bytes, datetime] | _Said | None] = queue.Queue(WAITING)
+        self._shares: Counter[str] = Counter()
         self._there: set[str] = set()
         self._gone: set[str] = set()
         self._new: set[str] = set()
@@ -83,10 +88,16 @@ class Intake:
 
     def heard(self, environment: str, robot: str, payload: bytes) -> None:
         """A robot's status as it came."""
-        try:
-            self._queue.put_nowait((environment, robot, payload, self._clock()))
-        except queue.Full:
-            self._lost += 1
+        with self._lock:
+            if self._shares[robot] >= SHARE:
+                self._lost += 1
+                return
+            try:
+                self._queue.put_nowait((environment, robot, payload, self._clock()))
+            except queue.Full:
+                self._lost += 1
+                return
+            self._shares[robot] += 1
 
     def note(self, heard: Heard) -> None:
         """A report that came over HTTP: blocks until it is stored. Raises what the store has against it."""
@@ -147,22 +158,29 @@ class Intake:
 
     def _take(self, seconds: float, most: int) -> list[_Said]:
         out: list[_Said] = []
+        refused: list[str] = []
         deadline = time.monotonic() + seconds
-        while len(out) < most:
+        for _ in range(most):
             try:
-                item = (
-                    self._queue.get(timeout=max(0.0, deadline - time.monotonic()))
-                    if not out
-                    else (self._queue.get_nowait())
-                )
+                wait = 0.0 if out or refused else max(0.0, deadline - time.monotonic())
+                item = self._queue.get(timeout=wait) if wait else self._queue.get_nowait()
             except queue.Empty:
                 break
             if item is None:
                 break
             if isinstance(item, _Said):
                 out.append(item)
-            elif (found := _read(*item)) is not None:
-                out.append(_Said(found))
+                continue
+            environment, robot, payload, came = item
+            with self._lock:
+                self._shares[robot] -= 1
+                if not self._shares[robot]:
+                    del self._shares[robot]
+            try:
+                out.append(_Said(_read(environment, robot, payload, came)))
+            except FleetMapError as error:
+                refused.append(f"a report of {robot!r:.128} in {environment!r:.64} was left out: {error.detail}")
+        _warn(refused)
         if self._lost:
             log.error("%d reports of robots were left out: they come faster than they can be stored", self._lost)
             self._lost = 0
@@ -171,10 +189,12 @@ class Intake:
     def _write(self, batch: list[_Said]) -> None:
         if not batch:
             return
+        unheard: list[str] = []
         for said, refused in zip(batch, self._store.note_reports([said.heard for said in batch]), strict=True):
             if refused is not None and said.told is None:
-                log.warning("a report of %s was left out: %s", said.heard.robot, refused.detail)
+                unheard.append(f"a report of {said.heard.robot} was left out: {refused.detail}")
             _tell(said, refused)
+        _warn(unheard)
 
     def _write_presence(self, *, everybody: bool) -> None:
         with self._lock:
@@ -203,11 +223,13 @@ def _tell(said: _Said, refused: FleetMapError | None) -> None:
         said.told.set_result(refused)
 
 
-def _read(environment: str, robot: str, payload: bytes, time: datetime) -> Heard | None:
-    try:
-        if not ROBOT_NAME.fullmatch(robot) or not ENVIRONMENT_NAME.fullmatch(environment):
-            raise Invalid("a robot's or environment's name cannot be used")
-        return Heard(environment, robot, report_of(RobotStatus.from_json(payload)), time)
-    except FleetMapError as error:
-        log.warning("a report of %.128r in %.64r was left out: %s", robot, environment, error.detail)
-        return None
+def _warn(reasons: list[str]) -> None:
+    """One line for many: who says nonsense all the time must not fill the disk."""
+    if reasons:
+        log.warning("%s%s", reasons[0], f" (and {len(reasons) - 1} others)" if len(reasons) > 1 else "")
+
+
+def _read(environment: str, robot: str, payload: bytes, time: datetime) -> Heard:
+    if not ROBOT_NAME.fullmatch(robot) or not ENVIRONMENT_NAME.fullmatch(environment):
+        raise Invalid("a robot's or environment's name cannot be used")
+    return Heard(environment, robot, report_of(RobotStatus.from_json(payload)), time)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from typing import Any
 
 import pytest
@@ -106,3 +107,56 @@ def test_what_comes_too_fast_is_told(
     intake.close()
     assert [r.version for _, r in store.robot_history("farm", "r1")] == [1, 0]
     assert "3 reports of robots were left out" in caplog.text
+
+
+def test_who_says_too_much_displaces_nobody(
+    api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("app.fleet.intake.SHARE", 3)
+    monkeypatch.setattr("app.fleet.intake.WAITING", 20)
+    store: Store = api.app.state.services.store
+    store.create_environment("farm")
+    intake = Intake(store)
+    for n in range(100):
+        intake.heard("farm", "loud", said(n))
+        intake.heard("nowhere", "lost", said(n))
+    for n in range(3):
+        intake.heard("farm", "calm", said(n))
+    intake.start()
+    eventually(lambda: len(store.robot_history("farm", "calm")) == 3)
+    assert [r.version for _, r in store.robot_history("farm", "loud")] == [2, 1, 0]
+    assert "194 reports of robots were left out" in caplog.text
+    assert caplog.text.count("of lost was left out") == 1, "one line for all three"
+    assert "(and 2 others)" in caplog.text
+    intake.heard("farm", "loud", said(7))
+    intake.close()
+    assert [r.version for _, r in store.robot_history("farm", "loud")] == [7, 2, 1, 0], "who is quiet again is heard"
+
+
+def test_nonsense_keeps_nothing_from_being_renewed(
+    api: Api, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Who was there stays there while somebody else never stops."""
+    monkeypatch.setattr("app.fleet.intake.RENEW_SECONDS", 0.2)
+    store: Store = api.app.state.services.store
+    intake, renewed, stop = Intake(store), [], threading.Event()
+    monkeypatch.setattr(store, "note_presence", lambda there, gone, now: renewed.append(there))
+    intake.alive("calm", there=True)
+
+    def shout() -> None:
+        while not stop.is_set():
+            intake.heard("farm", "loud", b"nonsense")
+
+    loud = threading.Thread(target=shout)
+    loud.start()
+    intake.start()
+    try:
+        eventually(lambda: len(renewed) > 3)
+    finally:
+        stop.set()
+        loud.join()
+        intake.close()
+    assert all(there == {"calm"} for there in renewed)
+    lines = [r for r in caplog.records if "a status is a JSON object" in r.getMessage()]
+    assert "others)" in caplog.text
+    assert lines
