@@ -7,6 +7,7 @@ from typing import Literal, get_args
 EventType = Literal[
     "version.created",
     "channel.planned",
+    "channel.cancelled",
     "channel.moved",
     "environment.created",
     "environment.deleted",

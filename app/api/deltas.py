@@ -48,7 +48,10 @@ class Deltas:
         return await self._running.run(key, self._between, key, body)
 
     def _between(self, key: tuple[str, str], body: bytes | Path) -> bytes | None:
-        made = self._make(key[0], body)
+        before = self._cache.by_hash(key[0], MAX_BYTES)
+        if before is None:
+            return None  # not remembered: it may be made (again) at any moment, and anybody can ask for any hash
+        made = _smaller(before, body if isinstance(body, bytes) else body.read_bytes(), bytes.fromhex(key[0]))
         with self._lock:
             self._known[key] = made
             self._size += len(made or b"") + 200
@@ -57,13 +60,10 @@ class Deltas:
                 self._size -= len(dropped or b"") + 200
         return made
 
-    def _make(self, old: str, body: bytes | Path) -> bytes | None:
-        before = self._cache.by_hash(old, MAX_BYTES)
-        after = body if isinstance(body, bytes) else body.read_bytes()
-        if before is None or not after:
-            return None
-        made = compress(before, after, bytes.fromhex(old))
-        return made if len(made) < len(after) else None
+
+def _smaller(before: bytes, after: bytes, digest: bytes) -> bytes | None:
+    made = compress(before, after, digest) if after else b""
+    return made if len(made) < len(after) else None
 
 
 def compress(before: bytes, after: bytes, digest: bytes) -> bytes:

@@ -149,10 +149,8 @@ class Intake:
                 if self._ending.wait(RETRY_SECONDS):
                     return
             except Exception:
-                log.exception("reports of robots could not be taken")
-                for said in batch:
-                    _tell(said, Unavailable("the server made a mistake; its log says where"))
-                batch = []
+                log.exception("reports of robots could not be taken together")
+                batch = self._write_each(batch)
             if self._ending.is_set() and self._queue.empty():
                 return
 
@@ -195,6 +193,20 @@ class Intake:
                 unheard.append(f"a report of {said.heard.robot} was left out: {refused.detail}")
             _tell(said, refused)
         _warn(unheard)
+
+    def _write_each(self, batch: list[_Said]) -> list[_Said]:
+        """Each on its own, so that one that cannot be taken harms no other; those for which the database is away."""
+        left = []
+        for said in batch:
+            try:
+                self._write([said])
+            except Unavailable as error:
+                _tell(said, error)
+                left += [said] if said.told is None else []
+            except Exception:
+                log.exception("a report of %s was left out", said.heard.robot)
+                _tell(said, Unavailable("the server made a mistake; its log says where"))
+        return left
 
     def _write_presence(self, *, everybody: bool) -> None:
         with self._lock:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from sqlalchemy import Connection, Row, insert, select, update
 
@@ -26,6 +26,8 @@ from app.store.values import (
     Version,
     rfc3339,
 )
+
+_NO_PLAN: Final[Mapping[str, None]] = {"planned_version": None, "planned_at": None, "planned_author": None}
 
 
 class Channels(Base):
@@ -92,8 +94,8 @@ class Channels(Base):
         """Move a channel to a version, or plan to (``activate_at``, an aware time); the plan of before is dropped.
 
         The event tells ``rollback: true`` where the version is lower than the channel's. Moving it to where it is
-        changes nothing. ``latest`` cannot be moved. rollout: in two stages; its version and root are set here. Whatever
-        roll-out was under way ends.
+        changes nothing but that a plan is dropped, which is told. ``latest`` cannot be moved. rollout: in two stages;
+        its version and root are set here. Whatever roll-out was under way ends.
         """
         _check_name(channel)
         if activate_at is not None and activate_at.tzinfo is None:
@@ -112,20 +114,17 @@ class Channels(Base):
 
     def cancel_planned(self, environment: str, channel: str, author: str) -> Channel:
         """Forget a planned move; NotFound where there is none."""
-        table = tables.channel
-        del author
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
             known = _row(connection, row, channel)
             if known is None or known.planned_version is None:
                 raise NotFound(f"channel {channel!r} of {environment} has no planned move")
-            connection.execute(
-                update(table)
-                .where(table.c.environment_id == row.id, table.c.name == channel)
-                .values(planned_version=None, planned_at=None, planned_author=None)
-            )
+            why, who = "the plan was cancelled", text(author, "an author")
             if known.rollout_state == "waiting":
-                _end(connection, row, known, "cancelled", "the plan was cancelled")
+                _end(connection, row, known, "cancelled", why, who)
+            else:
+                _store(connection, row, channel, known, **_NO_PLAN)
+                _tell_dropped(connection, row, known, why, who)
             return _read(connection, row, channel)
 
     def apply_due(self, now: datetime) -> list[tuple[str, Channel]]:
@@ -216,16 +215,19 @@ def _take(connection: Connection, environment: Row[Any], channel: Row[Any], step
             rollback=True,
         )
     else:
-        _end(connection, environment, channel, step.state, step.detail)
+        _end(connection, environment, channel, step.state, step.detail, channel.planned_author or "")
 
 
-def _end(connection: Connection, environment: Row[Any], channel: Row[Any], state: RolloutState, detail: str) -> None:
-    """A roll-out is over; a move that still waits for it is dropped."""
+def _end(
+    connection: Connection, environment: Row[Any], channel: Row[Any], state: RolloutState, detail: str, author: str
+) -> None:
+    """A roll-out is over; a move that still waits for it is dropped, which is told."""
     rollout = replace(Rollout.from_row(channel.rollout), state=state, detail=detail)
     values: dict[str, Any] = {"rollout": rollout.as_row(), "rollout_state": state}
-    if channel.rollout_state == "waiting":
-        values |= {"planned_version": None, "planned_at": None, "planned_author": None}
-    _store(connection, environment, channel.name, channel, **values)
+    dropped = channel.rollout_state == "waiting" and channel.planned_version is not None
+    _store(connection, environment, channel.name, channel, **values, **(_NO_PLAN if dropped else {}))
+    if dropped:
+        _tell_dropped(connection, environment, channel, detail, author)
 
 
 def _check_name(channel: str) -> None:
@@ -288,7 +290,7 @@ def _move(
     """Move a channel. rollout: what it belongs to; with a share of failures to look out for it is watched from now."""
     target = read_version(connection, environment, number)
     known = _row(connection, environment, channel)
-    nothing: dict[str, Any] = {"planned_version": None, "planned_at": None, "planned_author": None}
+    nothing: dict[str, Any] = {**_NO_PLAN}
     before = None
     if known is not None and known.version is not None:
         before = read_version(connection, environment, known.version)
@@ -302,6 +304,8 @@ def _move(
         nothing |= {"rollout": rollout.as_row(), "rollout_state": rollout.state}
     if before is not None and before.number == number:
         _store(connection, environment, channel, known, **nothing)
+        if known is not None and known.planned_version not in (None, number):
+            _tell_dropped(connection, environment, known, "the channel stays where it is", author)
         return
     sequence = environment.sequence + 1
     _store(
@@ -358,10 +362,20 @@ def _plan(
     _tell(connection, environment, "channel.planned", channel, before, target, **about)
 
 
+def _tell_dropped(connection: Connection, environment: Row[Any], channel: Row[Any], reason: str, author: str) -> None:
+    """A plan that no longer holds, and that no move replaces: whoever heard of it is told. channel: with the plan."""
+    before = None if channel.version is None else read_version(connection, environment, channel.version)
+    target = read_version(connection, environment, channel.planned_version)
+    sequence = environment.sequence + 1
+    _bump(connection, environment, sequence)
+    about = {"sequence": sequence, "author": author, "time": utcnow(), "reason": reason}
+    _tell(connection, environment, "channel.cancelled", channel.name, before, target, **about)
+
+
 def _tell(
     connection: Connection,
     environment: Row[Any],
-    kind: Literal["channel.planned", "channel.moved"],
+    kind: Literal["channel.planned", "channel.cancelled", "channel.moved"],
     channel: str,
     before: Version | None,
     target: Version,
@@ -369,7 +383,7 @@ def _tell(
     rollback: bool = False,
     **about: Any,
 ) -> None:
-    """The event of a channel that goes, or is planned to go, from one version to another."""
+    """The event of a channel that goes, is planned to go, or does not go after all, from one version to another."""
     outbox.append(
         connection,
         environment_id=environment.id,
@@ -378,7 +392,9 @@ def _tell(
         version=target.number,
         root=target.root,
         previous=None if before is None else (before.number, before.root),
-        layers=outbox.layer_changes(before.parts if before else (), target.parts),
+        layers=()
+        if kind == "channel.cancelled"
+        else outbox.layer_changes(before.parts if before else (), target.parts),
         message=target.message,
         channel=channel,
         rollback=rollback or (before is not None and target.number < before.number),

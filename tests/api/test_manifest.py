@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import hashlib
 import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, cast
 
 import httpx
 import pytest
@@ -16,6 +17,7 @@ from backports import zstd
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
+from app.api.deltas import Deltas
 from tests.api import samples
 from tests.api.conftest import Api
 
@@ -186,6 +188,27 @@ def test_without_a_known_dictionary_the_file_comes_whole(api: Api, farm: str, he
     assert answer.status_code == 200
     assert "content-encoding" not in answer.headers
     assert body == whole
+
+
+def test_a_dictionary_that_comes_late_is_taken() -> None:
+    """A robot offers a file that this server has not made (again) yet; asked once more, it has."""
+    old, new = many(), many(0.25)
+    names = [hashlib.sha256(data).hexdigest() for data in (old, new)]
+    shelf: dict[str, bytes] = {}
+
+    class Shelf:
+        def by_hash(self, sha256: str, most: int) -> bytes | None:
+            return shelf.get(sha256)
+
+    async def ask() -> bytes | None:
+        return await made.between(names[0], names[1], new)
+
+    made = Deltas(cast(Any, Shelf()))
+    assert asyncio.run(ask()) is None
+    shelf[names[0]] = old
+    delta = asyncio.run(ask())
+    assert delta is not None
+    assert unpack(delta, old) == new
 
 
 def test_a_fleet_that_asks_for_a_new_map_costs_one_conversion(api: Api, bare: str) -> None:

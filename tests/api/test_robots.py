@@ -77,6 +77,27 @@ def test_a_report_that_cannot_be_stored_is_told(api: Api, farm: str, monkeypatch
     api("PUT", "robots/late/status", 200, json=status(farm, "a" * 64))
 
 
+def test_one_report_that_cannot_be_taken_harms_no_other(
+    api: Api, farm: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = type(api.app.state.services.store)
+    quick = store.note_reports
+
+    def picky(self: Any, heard: Any) -> Any:
+        time.sleep(0.1)
+        if any(h.robot == "odd-3" for h in heard):
+            raise ValueError("a mistake")
+        return quick(self, heard)
+
+    monkeypatch.setattr(store, "note_reports", picky)
+
+    def report(k: int) -> int:
+        return api("PUT", f"robots/odd-{k}/status", None, json=status(farm, "a" * 64)).status_code
+
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(report, range(8))) == [200] * 3 + [503] + [200] * 4
+
+
 def test_the_list_comes_in_pages(api: Api, farm: str, bare: str) -> None:
     for env, names in ((farm, ("a", "B", "c", "d.1", "e")), (bare, ("a", "z"))):
         for name in names:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 
@@ -9,6 +10,7 @@ import pytest
 import shapely
 
 from app.errors import Conflict, Gone, Invalid, NotFound
+from app.events.messages import Event
 from app.model.features import features
 from app.model.frame import Datum
 from app.model.layers import PartKey
@@ -362,6 +364,32 @@ def test_channels_are_moved_planned_cancelled(store: Store):
         store.set_channel("farm", "production", 9, author="ann")
     with pytest.raises(Invalid, match="time zone"):
         store.set_channel("farm", "production", 1, author="ann", activate_at=datetime(2031, 1, 1))
+
+
+def test_a_plan_that_is_dropped_is_told(store: Store):
+    """Events carry ``activate_at``: who goes by them would switch all the same."""
+    store.create_environment("farm", datum=DATUM)
+    save(store, "farm", Replace(GRID, grid()))
+    soon = datetime.now(UTC) + timedelta(hours=1)
+    store.set_channel("farm", "staging", 2, author="ann", activate_at=soon)
+    store.cancel_planned("farm", "staging", "bob")
+    store.set_channel("farm", "staging", 1, author="ann")
+    store.set_channel("farm", "staging", 2, author="ann", activate_at=soon)
+    stays = store.set_channel("farm", "staging", 1, author="zoe")
+    store.set_channel("farm", "staging", 1, author="zoe")
+    store.set_channel("farm", "staging", 2, author="ann", activate_at=soon)
+    store.set_channel("farm", "staging", 2, author="zoe")
+    events = [e.body for e in store.events("farm", since=3)]
+    assert [(e["type"], e["version"]) for e in events] == [
+        ("channel.planned", 2), ("channel.cancelled", 2), ("channel.moved", 1), ("channel.planned", 2),
+        ("channel.cancelled", 2), ("channel.planned", 2), ("channel.moved", 2),
+    ]  # fmt: skip
+    assert [e["sequence"] for e in events] == list(range(4, 11))
+    first, second = events[1], events[4]
+    assert (first["previous"], first["author"], first["reason"]) == (None, "bob", "the plan was cancelled")
+    assert (second["previous"]["version"], second["author"], second["layers"]) == (1, "zoe", [])
+    assert stays.sequence == events[2]["sequence"], "it has not moved"
+    assert Event.from_json(json.dumps(second)).type == "channel.cancelled"
 
 
 def test_tokens_are_kept_hashed(store: Store):

@@ -132,6 +132,7 @@ def test_nobody_is_no_fleet(fleet: Fleet):
     assert now.rollout is not None
     assert now.rollout.detail == "only 0 of 0 robots are ready: the channel stays"
     assert fleet.tick(101) == (1, "expired")
+    assert [e["type"] for e in fleet.told()] == ["channel.planned", "channel.cancelled"]
 
 
 def test_not_before_its_time(fleet: Fleet):
@@ -198,7 +199,10 @@ def test_what_cannot_be_fetched_is_not_activated(fleet: Fleet):
     fleet.say("ab", 2, "failed", 2)
     assert fleet.tick(3) == (1, "failed")
     assert fleet.channel().planned is None
-    assert [e["type"] for e in fleet.told()] == ["channel.planned"]
+    planned, dropped = fleet.told()
+    assert (planned["type"], dropped["type"]) == ("channel.planned", "channel.cancelled")
+    assert (dropped["version"], dropped["previous"]["version"], dropped["author"]) == (2, 1, "bob")
+    assert "2 of 3 robots failed to fetch it" in dropped["reason"]
 
 
 def test_another_move_ends_a_rollout(fleet: Fleet):
