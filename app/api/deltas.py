@@ -25,6 +25,9 @@ MAGIC = bytes.fromhex("5e2a4d1820000000")
 MAX_BYTES = 64 * 2**20
 """Larger files go whole: a window of that size is the most that a client has to keep."""
 
+MIN_BYTES = 8
+"""Zstandard takes no smaller file as a dictionary."""
+
 LEVEL = 3
 
 
@@ -62,12 +65,14 @@ class Deltas:
 
 
 def _smaller(before: bytes, after: bytes, digest: bytes) -> bytes | None:
+    if len(before) < MIN_BYTES:
+        return None
     made = compress(before, after, digest) if after else b""
     return made if len(made) < len(after) else None
 
 
 def compress(before: bytes, after: bytes, digest: bytes) -> bytes:
-    """RFC 9842's dictionary-compressed Zstandard. digest: SHA-256 of ``before``."""
+    """RFC 9842's dictionary-compressed Zstandard. digest: SHA-256 of ``before``, which has 8 bytes or more."""
     window = max(10, min(27, max(len(before), len(after), 1).bit_length()))
     options: dict[int, int] = {
         zstd.CompressionParameter.compression_level: LEVEL,
@@ -75,8 +80,6 @@ def compress(before: bytes, after: bytes, digest: bytes) -> bytes:
         zstd.CompressionParameter.enable_long_distance_matching: int(len(before) > 2**20),
         zstd.CompressionParameter.checksum_flag: 1,
     }
-    if not before:
-        return MAGIC + digest + zstd.compress(after, options=options)
     dictionary = zstd.ZstdDict(before, is_raw=True)
     return MAGIC + digest + zstd.compress(after, options=options, zstd_dict=dictionary.as_prefix)
 

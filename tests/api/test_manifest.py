@@ -171,6 +171,31 @@ def test_a_delta_is_small_and_exact(api: Api, bare: str) -> None:
     assert again.headers["etag"] == answer.headers["etag"]
 
 
+def test_a_file_too_small_for_a_dictionary_is_none(api: Api, bare: str) -> None:
+    mesh = "<geometry><mesh><uri>model://shelf/note.stl</uri></mesh></geometry>"
+    model = (
+        f'<sdf version="1.9"><model name="shelf"><link name="l"><visual name="v">{mesh}</visual></link></model></sdf>'
+    )
+    config = "<model><name>shelf</name><version>1</version><sdf>model.sdf</sdf></model>"
+    world = '<sdf version="1.9"><world name="w"><include><uri>model://shelf</uri></include></world></sdf>'
+    folder = "models/shelf"
+
+    def upload(note: bytes) -> None:
+        files = {"world.sdf": world, f"{folder}/model.sdf": model, f"{folder}/model.config": config}
+        api.upload(bare, {**{name: text.encode() for name, text in files.items()}, f"{folder}/note.stl": note})
+
+    path = f"/maps/{bare}/gazebo/{folder}/note.stl"
+    for number, old in enumerate((b"abc", b"7 bytes")):
+        upload(old)
+        assert api.get(path).content == old
+        new = b"a note of more bytes than that, and more, and more, and more " * 3 + str(number).encode()
+        upload(new)
+        answer, body = raw(api, path, offered(old))
+        assert answer.status_code == 200, body
+        assert "content-encoding" not in answer.headers
+        assert body == new
+
+
 @pytest.mark.parametrize(
     "headers",
     [
