@@ -97,7 +97,8 @@ def agent(
         raise Invalid("--formats needs one format or several, separated by commas: occupancy_grid,tmap2")
 
     def tell(what: str, **members: Any) -> None:
-        with contextlib.suppress(OSError):  # a log on a full disk, or nobody who reads: the map is kept all the same
+        # A log on a full disk, or nobody who reads (where rich would exit): the map is kept all the same.
+        with contextlib.suppress(OSError, SystemExit):
             print_line(what, members)
 
     def print_line(what: str, members: dict[str, Any]) -> None:

@@ -628,20 +628,23 @@ def test_links_of_others_are_not_followed(fake: Fake, robot: Robot, tmp_path: Pa
     assert not (tmp_path / "absent").exists()
 
 
-def test_a_log_on_a_full_disk_stops_nobody(fake: Fake, tmp_path: Path) -> None:
+def test_a_log_that_takes_nothing_stops_nobody(fake: Fake, tmp_path: Path) -> None:
     arguments = ["agent", "-s", fake.url, "-e", PLACE, "-f", "kml", "--into", str(tmp_path / "robot"), "--once"]
-    with Path("/dev/full").open("w") as full:
-        for more in ([], ["--json"]):
+    reader, nobody = os.pipe()
+    os.close(reader)
+    with Path("/dev/full").open("w") as full, os.fdopen(nobody, "w") as closed:
+        for log, more in ((full, []), (full, ["--json"]), (closed, []), (closed, ["--json"])):
             told = subprocess.run(
                 [sys.executable, "-m", "app.cli", *arguments, *more],
                 env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT)},
-                stdout=full,
-                stderr=full,
+                stdout=log,
+                stderr=log,
                 timeout=60,
                 check=False,
             )
             assert whole(tmp_path / "robot")["version"] == len(fake.versions), told
-            fake.put(B)
+            assert fake.statuses[-1]["state"] == "active", "and it said so"
+            fake.put({"kml/map.kml": bytes(len(fake.versions))})
 
 
 # --- hooks ---
