@@ -22,6 +22,7 @@ from app.api.access import Access, Principal, Viewer
 from app.api.answers import Route
 from app.api.maps import number_of
 from app.api.problems import Throttled
+from app.api.protocol import ON_STOP
 from app.api.schemas import told
 from app.api.services import Here, Services
 from app.api.together import Together
@@ -64,6 +65,7 @@ class Feed:
         self._changed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self.streams = 0
+        self.ending = False
 
     async def wait(self, seconds: float) -> None:
         """Until something was committed, at most this long."""
@@ -92,6 +94,11 @@ class Feed:
         """Look a token up: Unauthenticated, Throttled, Unavailable."""
         key = (header, client, self._here.store.generation())
         await self._checks.run(key, self._here.access.check, header, client)
+
+    def end(self) -> None:
+        """The server stops: streams end, and begin again where it is back."""
+        self.ending = True
+        self._changed.set()
 
     async def _look(self) -> None:
         seen = self._here.store.generation()
@@ -143,6 +150,10 @@ async def stream_events(
     if feed.streams >= STREAMS:
         raise Unavailable("too many streams of events are open: close some, or poll with follow=false")
     headers = {"cache-control": "no-store", "x-accel-buffering": "no", "x-content-type-options": "nosniff"}
+    state = request.scope["state"]
+    if state.get("head"):
+        return StreamingResponse(_nothing(), media_type="text/event-stream", headers=headers)
+    state[ON_STOP] = feed.end
     client = request.client.host if request.client else None
     bearer = _Bearer(here.access, feed, who, request.headers.get("authorization"), client)
     stream = _stream(feed, bearer, environment, start, follow=follow)
@@ -166,6 +177,13 @@ def _begin(here: Services, environment: str | None, start: int | None) -> int:
         reason = f"nothing with the number {start} has happened here, the last is {newest}: begin with a lower one"
         raise Invalid(reason, [Problem("later than the log", where="since")])
     return newest if start is None else start
+
+
+async def _nothing() -> AsyncIterator[bytes]:
+    """What is left of a stream whose head alone is asked for."""
+    lines: tuple[bytes, ...] = ()
+    for line in lines:
+        yield line
 
 
 class _Bearer:
@@ -210,6 +228,8 @@ async def _stream(
             except Unavailable:  # the log is still there when the database is back
                 yield b": the database is away\n\n"
                 await asyncio.sleep(POLL_SECONDS)
+                if feed.ending:
+                    return
                 continue
             except NotFound:
                 return  # purged: whoever asks again is told so
@@ -220,7 +240,7 @@ async def _stream(
             if page:
                 quiet = 0.0
                 continue
-            if not follow:
+            if not follow or feed.ending:
                 return
             before = loop.time()
             await feed.wait(KEEP_ALIVE_SECONDS)

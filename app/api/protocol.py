@@ -15,6 +15,10 @@ MAX_HEAD = 64 * 2**10
 """Bytes of a request line and headers."""
 
 
+ON_STOP = "on_stop"
+"""In the ``state`` of a request's scope: what to call where the server stops before its answer has ended."""
+
+
 class BoundedProtocol(HttpToolsProtocol):
     """A client that sends its request's head slowly, or a huge one, is not waited for."""
 
@@ -54,6 +58,14 @@ class BoundedProtocol(HttpToolsProtocol):
         """The head is whole."""
         self._head_came()
         super().on_headers_complete()
+
+    def shutdown(self) -> None:
+        """The server stops: an answer that has no end of its own is told to come to one."""
+        if self.cycle is not None and not self.cycle.response_complete:
+            ending = self.cycle.scope["state"].get(ON_STOP)
+            if ending is not None:
+                ending()
+        super().shutdown()
 
     def data_received(self, data: bytes) -> None:
         """Bytes came in."""

@@ -125,5 +125,8 @@ def test_refusals(api: Api, bare: str) -> None:
     bad = api.get(f"events?environment={bare}", expect=None, headers={"last-event-id": "x"})
     assert bad.status_code == 422
     assert api.get("events?since=-1", expect=None).status_code == 422
+    head = api("HEAD", f"events?environment={bare}", 200)
+    assert (head.headers["content-type"], head.content) == ("text/event-stream; charset=utf-8", b"")
+    api.get("/healthz", timeout=10)  # on the same connection
     for query in (f"environment={bare}&since=2", f"since={10**9}"):
         assert "nothing with the number" in api.problem("GET", f"events?{query}&follow=false", 422)["detail"]

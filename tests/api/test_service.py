@@ -446,6 +446,13 @@ def test_stops_cleanly(tmp_path: Path) -> None:
         here = api.app.state.services
         workers = [w.process for w in here.pool._workers.values()]
         assert workers
+        listening = api.as_(api.token).http.stream("GET", f"{API}/events?since=0", timeout=60)
+        lines = listening.__enter__().iter_lines()
+        while "version.created" not in next(lines):
+            pass
+        api.others.clear()  # it listens on while the server stops
+    assert [line for line in lines if line.startswith("event")] == [], "and its stream comes to an end, not to a break"
+    listening.__exit__(None, None, None)
     assert not any(w.is_alive() for w in workers)
     assert not list((tmp_path / "spool").iterdir())
     with running(settings_for(tmp_path)) as api:
