@@ -100,6 +100,8 @@ def router_configuration(options: BusOptions) -> str:
     _set(config, "scouting/multicast/enabled", False)
     _set(config, "transport/shared_memory/enabled", False)
     _set(config, "transport/unicast/max_sessions", 10_000)
+    # With Zenoh's 100, so many who connect and say nothing keep everybody out for ten seconds.
+    _set(config, "transport/unicast/accept_pending", 1000)
     return str(config)
 
 

@@ -44,12 +44,12 @@ class Relay(Single):
             self._note(self._bus.state)
             self._ending.wait(POLL_SECONDS / 4)
             return
-        self._note(self._bus.state)
         if self._replayed_for != self._bus.opened:
             self._replay()
             self._replayed_for = self._bus.opened
         generation = self._store.generation()
         self._publish_new()
+        self._note(self._bus.state)  # not before: nothing goes out while the database is away
         # The database is asked all the same (another host may have committed), and the session looked after.
         asked = time.monotonic()
         while not self._ending.wait(LOOK_SECONDS):

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
 import signal
+import socket
 from pathlib import Path
+from typing import Any, ClassVar
 
 import pytest
 import zenoh
 
-from app.errors import Invalid
+from app.errors import Invalid, Unavailable
 from app.events.bus import Bus, BusOptions, router_configuration
 from app.events.messages import Event, RobotStatus
+from app.events.relay import Relay, state_of
 from app.events.router import Router
+from app.store import Store
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 from tests.events.conftest import Listener, client_config, eventually, free_port, nothing
@@ -88,8 +93,6 @@ def test_a_restarted_server_tells_what_it_had_not_told(tmp_path: Path, port: int
 
 
 def test_a_taken_port_is_told_and_maps_are_served(tmp_path: Path) -> None:
-    import socket
-
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -105,8 +108,6 @@ def test_a_taken_port_is_told_and_maps_are_served(tmp_path: Path) -> None:
 
 def test_a_taken_port_is_not_tried_all_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each try is a process."""
-    import socket
-
     started: list[Router] = []
 
     def counted(configuration: str) -> Router:
@@ -167,3 +168,86 @@ def test_statuses_are_checked(payload: bytes, word: str) -> None:
 def test_a_status_comes_through() -> None:
     said = {"channel": "production", "version": 3, "root": "0" * 64, "state": "active", "sequence": 7}
     assert RobotStatus.from_json(json.dumps(said)).as_dict() == said
+
+
+class Deaf:
+    """A bus that is always there."""
+
+    where, opened, connected = "nowhere", 1, True
+    state: ClassVar = {"state": "connected"}
+
+    def __init__(self) -> None:
+        self.put: list[int] = []
+
+    def tend(self) -> bool:
+        return True
+
+    def publish(self, _: str, body: Any) -> None:
+        self.put.append(body["sequence"])
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def test_a_database_that_is_away_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("app.events.single.POLL_SECONDS", 0.01)
+    store = Store(f"sqlite:///{tmp_path / 'store.sqlite'}", tmp_path / "blobs")
+    store.migrate()
+    store.create_environment("farm")
+    relayed, asked = store.relayed, []
+
+    def away() -> int:
+        asked.append(1)
+        if len(asked) < 20:
+            raise Unavailable("the database is away")
+        return relayed()
+
+    monkeypatch.setattr(store, "relayed", away)
+    bus = Deaf()
+    relay = Relay(store, bus, tmp_path)  # type: ignore[arg-type]
+    relay.start()
+    try:
+        eventually(lambda: state_of(tmp_path, "router") == {"state": "connected"})
+        assert bus.put == [1]
+        assert caplog.text.count("NO EVENTS GO OUT: the database is away") == 1
+    finally:
+        relay.close()
+        store.close()
+
+
+def test_what_a_router_logs_does_not_stop_it(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Zenoh logs to standard output, which is a pipe that is read once."""
+    monkeypatch.setenv("RUST_LOG", "zenoh=trace")
+    port = free_port()
+    router = Router(router_configuration(BusOptions(listen=f"tcp/127.0.0.1:{port}")))
+    try:
+        assert router.problem is None
+        monkeypatch.delenv("RUST_LOG")
+        heard: list[bytes] = []
+        with zenoh.open(client_config(port)) as here, zenoh.open(client_config(port)) as there:
+            held = here.declare_subscriber("some/**", lambda sample: heard.append(bytes(sample.payload)))
+            eventually(lambda: there.put("some/key", b"first") or heard)
+            for _ in range(200):
+                there.put("some/key", b"more", congestion_control=zenoh.CongestionControl.BLOCK)
+            eventually(lambda: heard.count(b"more") == 200)
+            held.undeclare()  # type: ignore[no-untyped-call]
+    finally:
+        router.close()
+    assert len(capfd.readouterr().err) > 2**16, "more than a pipe holds"
+
+
+def test_who_connects_and_says_nothing_keeps_nobody_out() -> None:
+    port = free_port()
+    router = Router(router_configuration(BusOptions(listen=f"tcp/127.0.0.1:{port}")))
+    assert router.problem is None
+    with contextlib.ExitStack() as silent:
+        silent.callback(router.close)
+        for _ in range(150):
+            silent.enter_context(socket.create_connection(("127.0.0.1", port)))
+        more = {"connect/timeout_ms": 5000, "connect/exit_on_failure": True}
+        with zenoh.open(client_config(port, **more)) as session:
+            assert list(session.info.routers_zid())

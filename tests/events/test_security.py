@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import zenoh
+from zenoh import ext
 
 from app.agent.ear import Ear
 from app.cli.serving import check
@@ -133,9 +134,20 @@ def test_a_robot_says_nothing_else(api: Api, r1: zenoh.Session, r2: zenoh.Sessio
         r1.delete(key)
     r1.put("fleetmap/farm/robots/r2/status", said(66))
     r1.put("fleetmap/nowhere/robots/r1/status/more", said(66))
-    names = ("fleetmap/robots/r2", "fleetmap/server", "@ros2_lv/0/x")
-    shown = [r1.liveliness().declare_token(key) for key in names]
-    forged = r1.declare_queryable("fleetmap/farm/1/version", lambda query: query.reply(query.key_expr, b"forged"))
+    for key in ("**", "fleetmap/**", "fleetmap/*/events", "fleetmap/farm/e$*", "fleetmap/**/robots/r1/status", "@/**"):
+        r1.put(key, b'{"sequence": 9999}')
+    advanced = ext.declare_advanced_publisher(
+        r1,
+        "fleetmap/farm/events",
+        cache=ext.CacheConfig(10),
+        publisher_detection=True,
+        sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.1),
+    )
+    advanced.put(b'{"sequence": 9999}')
+    names = ("fleetmap/robots/r2", "fleetmap/robots/*", "fleetmap/server", "fleetmap/**", "@ros2_lv/0/x")
+    shown = [r1.liveliness().declare_token(key) for key in (*names, "fleetmap/farm/events/@adv/pub/1/1/_")]
+    answered = ("fleetmap/farm/1/version", "fleetmap/**", "**", "fleetmap/farm/events/@adv/**")
+    forged = [r1.declare_queryable(key, lambda query: query.reply(query.key_expr, b"forged")) for key in answered]
     r1.put("fleetmap/farm/robots/r1/status", said(2))  # what was said before was taken or dropped before
     eventually(lambda: (r := robot_of(api, "r1")) and r["version"] == 2)
     made = api.upload("farm", {"network.tmap2.yaml": samples.tmap2(edges=(("gate", "barn"),))}).json()
@@ -155,7 +167,10 @@ def test_a_robot_says_nothing_else(api: Api, r1: zenoh.Session, r2: zenoh.Sessio
     answers = [bytes(reply.ok.payload) for reply in r2.get("fleetmap/farm/1/version", timeout=5.0) if reply.ok]
     assert len(answers) == 1
     assert json.loads(answers[0])["version"] == 1
-    for held in (*shown, forged):
+    late = Listener(r2, "fleetmap/farm/events")
+    late.wait(lambda e: len(e.events) == len(events.events))
+    assert 9999 not in late.sequences()
+    for held in (*shown, *forged, advanced):
         held.undeclare()  # type: ignore[no-untyped-call]
 
 
