@@ -255,8 +255,8 @@ class Agent:
         else:
             concerns = event.channel in ours or event.type.startswith("environment.")
         if concerns:
-            if event.type in ("version.created", "channel.moved"):
-                self._called = event.sequence
+            if event.type == "channel.moved" or (event.type == "version.created" and channel == LATEST):
+                self._called = event.sequence  # so far the channel that is followed has moved
             self._wake.set()
 
     @property
@@ -314,6 +314,8 @@ class Agent:
         except OSError as error:
             self._fail("failed", f"{error.filename or self._folder.path}: {error.strerror or error}")
             good = False
+        except Stopped:
+            raise
         except Exception as error:  # noqa: BLE001  a mistake of ours; who ends here is of no use to a robot
             where = traceback.extract_tb(error.__traceback__)[-1]
             place = f"{Path(where.filename).name}:{where.lineno}"

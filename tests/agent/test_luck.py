@@ -91,6 +91,20 @@ def test_it_looks_again_where_the_server_knew_less_than_its_event(
         assert not fake.asked, "and then it is content"
 
 
+def test_a_version_that_the_channel_does_not_follow_is_not_waited_for(
+    fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 0.001)
+    fake.move("production", 1)
+    one = robot(poll_seconds=3600.0)
+    one.agent._heard(event(9))  # before it knows which channel it follows
+    with run(one):
+        eventually(lambda: one.saw("active", version=1))
+        one.agent._heard(event(10))
+        time.sleep(0.3)
+    assert sum("/manifest" in path for path in fake.asked) == 1
+
+
 def test_an_event_that_never_comes_true_costs_ever_less(
     fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -378,9 +392,11 @@ def test_it_ends_at_once_while_a_server_hangs(fake: Fake, robot: Robot, part: st
         return part in handler.path
 
     fake.instead = hang
-    with run(robot()):
+    one = robot()
+    with run(one):
         assert hangs.wait(20)
     gone.set()
+    assert not one.saw("failed"), "to end is no failure"
 
 
 def test_a_mistake_of_ours_is_told_and_gone_on_from(fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
