@@ -63,6 +63,9 @@ class Container:
         defaulted = {k: re.sub(r"\$\{\w+:-(.*?)\}", r"\1", str(v)) for k, v in environment.items()}
         self.environment = {k: self._mapped(v) for k, v in defaulted.items()}
         self.environment["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+        if "PYTHONPYCACHEPREFIX" in os.environ:  # in the image all is compiled when it is built
+            self.environment["PYTHONPYCACHEPREFIX"] = os.environ["PYTHONPYCACHEPREFIX"]
+            self.environment.pop("PYTHONDONTWRITEBYTECODE", None)
         self.command = [*said["entrypoint"], *(service.get("command") or said["cmd"])]
         self.healthcheck = said["healthcheck"]
         self.workdir = self._mapped(said["workdir"])
