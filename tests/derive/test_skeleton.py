@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -49,15 +50,20 @@ def one_cell_wide(skeleton: Mask) -> None:
     """No cell but an end can go without changing pieces or holes: told cell by cell with the library."""
     padded = np.pad(skeleton, 1)
     for y, x in np.argwhere(padded):
-        around = padded[y - 1 : y + 2, x - 1 : x + 2].copy()
-        if around.sum() <= 2:
-            continue
-        around[1, 1] = False
-        holes = label(~np.pad(around, 1), connectivity=1).max()
-        cut = label(around, connectivity=2).max() > 1
-        # A cell whose four sides are all set encloses nothing when it stays and a hole when it goes.
-        opened = holes > 1
-        assert cut or opened, (y, x)
+        assert needed(padded[y - 1 : y + 2, x - 1 : x + 2].tobytes()), (y, x)
+
+
+@cache
+def needed(window: bytes) -> bool:
+    """Whether the middle of 3 × 3 cells is an end, or changes pieces or holes when it goes."""
+    around = np.frombuffer(window, np.bool_).reshape(3, 3).copy()
+    if around.sum() <= 2:
+        return True
+    around[1, 1] = False
+    cut = label(around, connectivity=2).max() > 1
+    # A cell whose four sides are all set encloses nothing when it stays and a hole when it goes.
+    opened = label(~np.pad(around, 1), connectivity=1).max() > 1
+    return bool(cut or opened)
 
 
 def masks(count: int) -> list[Mask]:
