@@ -177,6 +177,7 @@ class Hot:
             (b"cache-control", b"no-cache"),
             (b"fleetmap-version", str(version.number).encode()),
             (b"fleetmap-root", version.root.encode()),
+            (b"vary", b"accept-encoding, available-dictionary"),  # with 304 as well (RFC 9110, 15.4.5)
         ]
         link = f'<{report}{"?" + query if query else ""}>; rel="describedby"'.encode()
         headers = [*bare, (b"link", link), (b"x-content-type-options", b"nosniff")]
@@ -283,7 +284,6 @@ def _filled(empty: Resource, made: Made) -> Resource:
         (b"content-disposition", content_disposition(file.name).encode()),
         *empty.headers,
         (b"use-as-dictionary", _dictionary(empty.wanted).encode()),
-        (b"vary", b"accept-encoding, available-dictionary"),
     ]
     if file.size > IN_MEMORY:
         return replace(empty, headers=headers, size=file.size, path=file.path, sha256=file.sha256)
