@@ -134,20 +134,16 @@ class Outbox(Base):
                 connection.execute(update(table).where(table.c.id == 1).values(position=position))
 
     def last_events(self, position: int, each: int, most: int) -> list[Event]:
-        """The last ``each`` events up to a position of all environments, in the order of the log.
+        """The last ``each`` events up to a position of all environments, purged ones too, in the order of the log.
 
         Where those are more than ``most``, each environment has fewer; where not even the last one of each fits, the
         environments that were silent longest have none.
         """
-        table, owner = tables.event, tables.environment
+        table = tables.event
         rank = func.row_number().over(partition_by=table.c.environment_id, order_by=table.c.sequence.desc())
         recent = (
             select(table.c.position, rank.label("rank"))
-            .where(
-                table.c.position <= position,
-                table.c.position > position - REACH,
-                table.c.environment_id.in_(select(owner.c.id)),
-            )
+            .where(table.c.position <= position, table.c.position > position - REACH)
             .subquery()
         )
         chosen = (

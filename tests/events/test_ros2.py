@@ -501,6 +501,39 @@ def test_what_cannot_be_had_leaves_the_last_map_and_is_tried_again(
         publishing.close()
 
 
+def test_a_mistake_with_one_environment_is_not_the_others(
+    router: tuple[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("app.events.ros2.RETRY_SECONDS", 0.1)
+    monkeypatch.setattr("app.events.ros2.ASK_SECONDS", 0.1)
+    where, port = router
+
+    def fetch(asked: Any) -> Content:
+        if asked.environment == "bad":
+            raise KeyError("nobody thought of this")
+        return Content({None: SMALL}, None)
+
+    publishing = Ros2(
+        Ros2Options((Chosen("*", None),), ("ros2dds",)),
+        BusOptions(mode="client", connect=where),
+        tmp_path,
+        generation=lambda: 0,
+        look=lambda: {name: version(name, "r") for name in ("bad", "good")},
+        fetch=fetch,
+    )
+    publishing.start()
+    try:
+        with zenoh.open(client_config(port)) as session:
+            heard = Heard(session, "good/map")
+            heard.wait()
+            eventually(lambda: caplog.text.count("ROS 2: bad stays as it is") > 3)
+            assert state_of(tmp_path) == {"state": "connected", "topics": 2}
+            assert len(heard.samples) == 1, "the topics of the others stay as they are"
+            assert "stumbled" not in caplog.text
+    finally:
+        publishing.close()
+
+
 def test_without_a_router_it_is_told_and_found_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.events.bus.CONNECT_SECONDS", 0.3)
     port = free_port()

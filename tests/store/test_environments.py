@@ -258,11 +258,12 @@ def test_the_last_events_of_all_environments(store: Store):
         assert [e.position for e in found] == sorted(e.position for e in found)
         return [(e.environment, e.sequence) for e in found]
 
-    calm, moved = [("calm", 1), ("calm", 2)], [("moved", 1), ("moved", 2), ("moved", 3), ("moved", 4), ("here", 5)]
-    assert last(9, 99) == [*[("busy", n) for n in range(1, 7)], *calm, *moved]
-    assert last(2, 99) == [("busy", 5), ("busy", 6), *calm, *moved[-2:]]
-    assert last(9, 7) == [("busy", 5), ("busy", 6), *calm, *moved[-3:]], "each has its last ones"
-    assert last(9, 2) == [("calm", 2), ("here", 5)], "the one that was silent longest has none"
+    begun = [("busy", n) for n in range(1, 7)] + [("calm", 1), ("calm", 2), ("gone", 1), ("gone", 2)]
+    ended = [("gone", 3), ("moved", 4), ("here", 5)]
+    assert last(9, 99) == [*begun, ("moved", 1), ("moved", 2), ("moved", 3), *ended]
+    assert last(1, 99) == [("busy", 6), ("calm", 2), ("gone", 3), ("here", 5)]
+    assert last(9, 7) == [("busy", 6), ("calm", 1), ("calm", 2), ("gone", 2), *ended], "each has its last ones"
+    assert last(9, 2) == [("gone", 3), ("here", 5)], "the ones that were silent longest have none"
     assert last(9, 99, position=2) == [("busy", 1), ("busy", 2)]
 
 
