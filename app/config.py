@@ -160,7 +160,8 @@ class Settings(BaseSettings):
     zenoh_max_reply_bytes: int = Field(
         default=64 * 2**20,
         ge=1024,
-        description="Largest file (or grid for ROS 2) that goes over Zenoh; HTTP has no such bound.",
+        description="Largest file (or grid for ROS 2) that goes over Zenoh; HTTP has no such bound. Its own router "
+        "drops messages that are larger than this and than 65 MiB, unless there is a `zenoh_config`.",
     )
 
     ros2_environments: str = Field(

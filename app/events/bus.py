@@ -44,6 +44,9 @@ wait for what is being made."""
 WAITING = 256
 """Queries that may wait; further ones are told so."""
 
+MESSAGE_BYTES = 65 * 2**20
+"""Largest message that our router passes on, where maps may not be larger."""
+
 RESTART_SECONDS = 8.0
 """Longest pause before a router of ours that could not be started is tried again."""
 
@@ -100,6 +103,9 @@ def router_configuration(options: BusOptions) -> str:
     _set(config, "scouting/multicast/enabled", False)
     _set(config, "transport/shared_memory/enabled", False)
     _set(config, "transport/unicast/max_sessions", 10_000)
+    if options.config is None:
+        # Zenoh's is 1 GiB, and what comes in pieces is put together in memory before it is passed on.
+        _set(config, "transport/link/rx/max_message_size", max(MESSAGE_BYTES, options.max_reply_bytes + 2**20))
     # With Zenoh's 100, so many who connect and say nothing keep everybody out for ten seconds.
     _set(config, "transport/unicast/accept_pending", 1000)
     return str(config)

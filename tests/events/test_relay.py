@@ -251,3 +251,21 @@ def test_who_connects_and_says_nothing_keeps_nobody_out() -> None:
         more = {"connect/timeout_ms": 5000, "connect/exit_on_failure": True}
         with zenoh.open(client_config(port, **more)) as session:
             assert list(session.info.routers_zid())
+
+
+def test_a_huge_message_is_dropped_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.events.bus.MESSAGE_BYTES", 2**20)
+    port = free_port()
+    router = Router(router_configuration(BusOptions(listen=f"tcp/127.0.0.1:{port}", max_reply_bytes=2**19)))
+    assert router.problem is None
+    heard: list[int] = []
+    with contextlib.ExitStack() as stack:
+        stack.callback(router.close)
+        here, there = (stack.enter_context(zenoh.open(client_config(port))) for _ in range(2))
+        held = here.declare_subscriber("some/**", lambda sample: heard.append(len(sample.payload)))
+        eventually(lambda: there.put("some/key", b"1") or heard)
+        for size in (2**19, 2**22, 2):
+            there.put("some/key", bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)
+        eventually(lambda: heard[-1] == 2)
+        assert [size for size in heard if size != 1] == [2**19, 2]
+        held.undeclare()  # type: ignore[no-untyped-call]
