@@ -12,7 +12,7 @@ import ssl
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urljoin
@@ -36,6 +36,7 @@ TIMEOUT = httpx.Timeout(10.0, read=60.0)
 HEAD_SECONDS = 90.0
 """Until an answer has begun: whoever sends its head byte by byte keeps nobody waiting."""
 
+WATCH_SECONDS = 0.5
 WHOLE_SECONDS = 300.0
 """Until a manifest or another small answer has come."""
 
@@ -69,6 +70,40 @@ class Busy(Unavailable):
     def __init__(self, detail: str, seconds: float = 0.0) -> None:
         super().__init__(detail)
         self.seconds = seconds
+
+
+class _Watch:
+    """One thread for all requests of the process: a timer for each would cost more than the request."""
+
+    def __init__(self) -> None:
+        self._due: dict[object, tuple[float, Callable[[], None]]] = {}
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    @contextlib.contextmanager
+    def within(self, seconds: float, late: Callable[[], None]) -> Iterator[None]:
+        """``late`` is called, in another thread, where the body takes longer than this, by a second at most."""
+        with self._lock:
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._look, name="fleetmap-watch", daemon=True)
+                self._thread.start()
+        entry = object()
+        self._due[entry] = (time.monotonic() + seconds, late)
+        try:
+            yield
+        finally:
+            self._due.pop(entry, None)
+
+    def _look(self) -> None:
+        while True:
+            time.sleep(WATCH_SECONDS)
+            now = time.monotonic()
+            for entry, (until, late) in list(self._due.items()):
+                if until < now and self._due.pop(entry, None) is not None:
+                    late()
+
+
+_watch = _Watch()
 
 
 class Web:
@@ -299,13 +334,8 @@ class Web:
             method, path, headers=dict(headers), json=body, extensions={"trace": self._note}
         )
         with self._reach():
-            late = threading.Timer(HEAD_SECONDS, self.interrupt)
-            late.daemon = True
-            late.start()
-            try:
+            with _watch.within(HEAD_SECONDS, self.interrupt):
                 answer = self._http.send(request, stream=True)
-            finally:
-                late.cancel()
             with contextlib.closing(answer):
                 yield answer
 
