@@ -82,21 +82,55 @@ def promote(
     ] = "latest",
     channel: Annotated[str, typer.Option("--channel", "-c", help="The channel to move.")] = "production",
     at: Annotated[str | None, typer.Option("--at", metavar="TIME", help="Activate then (RFC 3339), not now.")] = None,
+    ready: Annotated[
+        float | None,
+        typer.Option("--ready", metavar="SHARE", help="Move when this share of its online robots has it (0.9)."),
+    ] = None,
+    failed: Annotated[
+        float | None,
+        typer.Option(
+            "--failed", metavar="SHARE", help="Move back, or do not move, when this share of its robots fails (0.2)."
+        ),
+    ] = None,
+    deadline: Annotated[
+        str | None,
+        typer.Option("--deadline", metavar="TIME", help="Without enough robots it stays then (needs --ready)."),
+    ] = None,
+    window: Annotated[
+        float | None,
+        typer.Option("--window", metavar="SECONDS", help="How long robots are watched after the move [default: 600]."),
+    ] = None,
+    cancel: Annotated[bool, typer.Option("--cancel", help="Drop what is planned for the channel.")] = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Move a channel to a version: roll out, roll back."""
+    """Move a channel to a version: roll out, in two stages where you say so, or roll back."""
+    stages = {"ready": ready, "failed": failed, "deadline": deadline, "window": window}
+    rollout = {name: value for name, value in stages.items() if value is not None}
     with Client(server, token) as client:
-        number = resolve(client, environment, version)
-        body = {"version": number, "activate_at": at}
-        moved = client.put(path_of("environments", environment, "channels", channel), body)
+        path = path_of("environments", environment, "channels", channel)
+        if cancel:
+            if at is not None or rollout:
+                raise typer.BadParameter("--cancel plans nothing: leave the other options out")
+            client.delete(f"{path}/planned")
+            found = client.get(path_of("environments", environment, "channels"), {"robots": "false"})
+            moved: Any = next((c for c in found if c["channel"] == channel), {"channel": channel, "version": None})
+        else:
+            number = resolve(client, environment, version)
+            moved = client.put(path, {"version": number, "activate_at": at, "rollout": rollout or None})
     if as_json:
         output.show_json(moved)
-    elif at:
-        output.show(f"{environment}: {channel} will stand on version {number} at {at}")
+    elif cancel:
+        output.show(f"{environment}: nothing is planned for {channel} any more")
+    elif moved["planned"] is None:
+        watched = (moved["rollout"] or {}).get("state") == "watching"
+        more = ", and moves back where too many robots fail" if watched else ""
+        output.show(f"{environment}: {channel} stands on version {number}{more}")
     else:
-        output.show(f"{environment}: {channel} stands on version {number}")
+        when = [f"{ready:.4g} of its online robots have it"] if ready is not None else []
+        when += [f"it is {at}"] if at else []
+        output.show(f"{environment}: {channel} will stand on version {number} when {' and '.join(when)}")
 
 
 def revert(
