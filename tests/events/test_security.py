@@ -244,7 +244,7 @@ def test_who_listens_on_the_wire_hears_nothing(api: Api, port: int, authority: A
     finally:
         wire.close()
     assert len(wire.heard) > 2000
-    for word in (b"fleetmap", b"version.created", b"word one", b"r1"):
+    for word in (b"fleetmap", b"version.created", b"word one", b"robots/r1"):  # long enough not to come by chance
         assert word not in wire.heard
 
 
