@@ -6,6 +6,7 @@ import asyncio
 import base64
 import dataclasses
 import hashlib
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
@@ -78,13 +79,18 @@ async def get_manifest(
     is that of the event that brought the channel (or the version) there: a robot refuses a lower one.
     """
     names = _names(formats)
+    made: dict[str, Made] = {}
     while True:
-        found = await here.hot.shared(request, _signed, here, env, v, names, request)
+        found = await here.hot.shared(request, _signed, here, env, v, names, request, {})
+        if isinstance(found, Recipe) and found.key in made:  # the cache has no room for all of them at once
+            found = await run_in_threadpool(_signed, here, env, v, names, request, made)
         if not isinstance(found, Recipe):
             break
         outcome = await _made(here, found, request, who)
         if isinstance(outcome, Started):
             return started(outcome.job)
+        if outcome is not None:
+            made[found.key] = outcome
     headers, data = found
     if none_match(request.headers.get("if-none-match"), headers["etag"]):
         return Response(status_code=304, headers=headers)
@@ -92,9 +98,12 @@ async def get_manifest(
 
 
 def _signed(
-    here: Services, env: str, v: str, names: list[str], request: Request
+    here: Services, env: str, v: str, names: list[str], request: Request, known: Mapping[str, Made]
 ) -> tuple[dict[str, str], bytes] | Recipe:
-    """The headers and the signed bytes; the first map that is to be made before that can be said."""
+    """The headers and the signed bytes; the first map that is to be made before that can be said.
+
+    known: maps that were made for this answer, by their recipes' keys: they may have left the cache again.
+    """
     channel = None if isinstance(number_of(v), int) else v
     generation = here.hot.generation()
     version, sequence = here.store.standing(env, number_of(v))
@@ -103,7 +112,7 @@ def _signed(
         seen: set[str] = set()
         for values in _variants(name, version):
             recipe = here.maps.recipe(version, name, values)
-            made = here.maps.ready(recipe)
+            made = here.maps.ready(recipe) or known.get(recipe.key)
             if made is None:
                 return recipe
             for file in made.files:

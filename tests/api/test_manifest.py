@@ -9,6 +9,7 @@ import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any, cast
 
 import httpx
@@ -19,7 +20,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 from app.api.deltas import Deltas
 from tests.api import samples
-from tests.api.conftest import Api
+from tests.api.conftest import Api, running, settings_for
 
 
 def keys(api: Api) -> dict[str, Ed25519PublicKey]:
@@ -295,3 +296,14 @@ def test_what_a_fleet_asks_for_at_once_comes_from_memory_and_is_never_old(api: A
     new = api.post("keys", expect=201).json()["id"]
     assert api.get(asked[0]).headers["fleetmap-signature"].partition(":")[0] == new != old
     assert "robots" in api.get(f"{place}/channels").json()[0]
+
+
+def test_a_cache_without_room_for_two_maps_still_gives_a_manifest_of_both(tmp_path: Path) -> None:
+    with running(settings_for(tmp_path, cache_bytes=0)) as api:
+        api.post("environments", {"name": "small"})
+        api.upload("small", {"n.tmap2.yaml": many()})
+        body = api.get("environments/small/versions/latest/manifest?formats=tmap2,geojson", timeout=30).json()
+        assert {file["format"] for file in body["files"]} == {"tmap2", "geojson"}
+        for file in body["files"]:
+            data = api.get(f"/maps/small/{file['format']}/{file['name']}").content
+            assert hashlib.sha256(data).hexdigest() == file["sha256"]
