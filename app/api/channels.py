@@ -41,6 +41,11 @@ def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> 
         "version": channel.version,
         "root": channel.root,
         "sequence": channel.sequence,
+        "overlays": {
+            "count": len(channel.closures.items),
+            "digest": channel.closures.digest,
+            "sequence": channel.closures_sequence,
+        },
         "author": channel.author,
         "time": rfc3339(channel.time),
         "planned": planned,

@@ -20,7 +20,7 @@ from starlette.responses import Response, StreamingResponse
 
 from app.api.access import Access, Principal, Viewer
 from app.api.answers import Route
-from app.api.maps import number_of
+from app.api.maps import closure_mode, number_of
 from app.api.problems import Throttled
 from app.api.protocol import ON_STOP
 from app.api.schemas import told
@@ -263,8 +263,8 @@ def ask(here: Services, most: int, environment: str, rest: str, parameters: Mapp
     most: so many bytes are answered. Blocks. Raises what the calls over HTTP answer as problems.
     """
     pieces = rest.split("/")
-    version = here.store.version(environment, number_of(pieces[0]))
     if pieces[1:] == ["version"]:
+        version = here.store.version(environment, number_of(pieces[0]))
         _no_parameters(parameters)
         return Answer(orjson.dumps(version.as_dict()), "application/json")
     if len(pieces) < 3 or pieces[1] != "maps":
@@ -273,6 +273,8 @@ def ask(here: Services, most: int, environment: str, rest: str, parameters: Mapp
     derive = values.pop("derive", "true")
     if derive not in ("true", "false"):
         raise Invalid("derive must be true or false", [Problem("true or false", where="derive")])
+    mode = closure_mode(values.pop("closures", None))
+    version, _ = here.store.standing(environment, number_of(pieces[0]), mode)
     name, file = pieces[2], "/".join(pieces[3:]) or None
     made = here.maps.ready(here.maps.recipe(version, name, values, derive=derive == "true", file=file))
     if made is not None:

@@ -20,12 +20,13 @@ from app.api.answers import Route, answer, json_bytes
 from app.api.caching import none_match
 from app.api.jobs import Started, started
 from app.api.maps import address_of, number_of
-from app.api.schemas import EnvironmentPath, KeyOut, ManifestOut, VersionPath, told
+from app.api.schemas import Closing, EnvironmentPath, KeyOut, ManifestOut, VersionPath, told
 from app.api.services import Here, Services
 from app.convert import Recipe
 from app.convert.cache import Made
 from app.errors import CannotDerive, Invalid, NotFound, Problem
 from app.events.messages import SIGNATURE
+from app.model.closures import NO_CLOSURES, ClosureMode
 from app.store.values import Version, frame_line, rfc3339
 
 STEP_SECONDS = 600
@@ -72,18 +73,20 @@ async def get_manifest(
             examples=["geojson,kml"],
         ),
     ],
+    closures: Closing = None,
 ) -> Response:
     """Names, sizes and hashes of the files of maps, signed with the server's key over exactly these bytes.
 
     The header `Fleetmap-Signature` is `<key id>:<base64 of the Ed25519 signature>`; `/keys` has the keys. `sequence`
-    is that of the event that brought the channel (or the version) there: a robot refuses a lower one.
+    is that of the event that brought the channel (or the version) there, or that last changed which closures are in
+    force: a robot refuses a lower one.
     """
     names = _names(formats)
     made: dict[str, Made] = {}
     while True:
-        found = await here.hot.shared(request, _signed, here, env, v, names, request, {})
+        found = await here.hot.shared(request, _signed, here, env, v, names, closures, request, {})
         if isinstance(found, Recipe) and found.key in made:  # the cache has no room for all of them at once
-            found = await run_in_threadpool(_signed, here, env, v, names, request, made)
+            found = await run_in_threadpool(_signed, here, env, v, names, closures, request, made)
         if not isinstance(found, Recipe):
             break
         outcome = await _made(here, found, request, who)
@@ -98,7 +101,13 @@ async def get_manifest(
 
 
 def _signed(
-    here: Services, env: str, v: str, names: list[str], request: Request, known: Mapping[str, Made]
+    here: Services,
+    env: str,
+    v: str,
+    names: list[str],
+    mode: ClosureMode | None,
+    request: Request,
+    known: Mapping[str, Made],
 ) -> tuple[dict[str, str], bytes] | Recipe:
     """The headers and the signed bytes; the first map that is to be made before that can be said.
 
@@ -106,7 +115,8 @@ def _signed(
     """
     channel = None if isinstance(number_of(v), int) else v
     generation = here.hot.generation()
-    version, sequence = here.store.standing(env, number_of(v))
+    version, sequence = here.store.standing(env, number_of(v), mode)
+    closures = version.closures or NO_CLOSURES
     files: list[dict[str, Any]] = []
     for name in names:
         seen: set[str] = set()
@@ -120,16 +130,20 @@ def _signed(
                     seen.add(file.name)
                     files.append({"format": name, "name": file.name, "size": file.size, "sha256": file.sha256})
     now = datetime.now(UTC).timestamp()
-    expires = (int(now) // STEP_SECONDS) * STEP_SECONDS + here.options.manifest_seconds
+    signed = (int(now) // STEP_SECONDS) * STEP_SECONDS
     body: dict[str, Any] = {"environment": env}
     if channel is not None:
         body["channel"] = channel
     body |= {
+        "epoch": here.store.epoch(),
         "sequence": sequence,
         "version": version.number,
         "root": version.root,
-        "expires": rfc3339(datetime.fromtimestamp(expires, UTC)),
+        "time": rfc3339(datetime.fromtimestamp(signed, UTC)),
+        "expires": rfc3339(datetime.fromtimestamp(signed + here.options.manifest_seconds, UTC)),
         "files": sorted(files, key=lambda f: (f["format"], f["name"])),
+        "overlays": [closure.as_dict() for closure in closures.items],
+        "overlays_digest": closures.digest,
         "layers": _layers(version),
     }
     variables = here.maps.variables(version)
@@ -137,8 +151,8 @@ def _signed(
         body["variables"] = variables
     data = json_bytes(body)
     key, signature = here.keys.sign(data)
-    signed = f"{key}:{base64.b64encode(signature).decode()}"
-    headers = {"etag": f'"{signed[-40:-2]}"', "cache-control": "no-cache", SIGNATURE: signed}
+    header = f"{key}:{base64.b64encode(signature).decode()}"
+    headers = {"etag": f'"{header[-40:-2]}"', "cache-control": "no-cache", SIGNATURE: header}
     here.hot.keep(request, env, headers, data, generation)
     return headers, data
 

@@ -37,6 +37,7 @@ from app.api.together import Together
 from app.convert import Recipe
 from app.convert.cache import Made, MadeFile
 from app.errors import CannotDerive, Invalid, NotFound, Problem
+from app.model.closures import CLOSURE_MODES, ClosureMode
 from app.store.values import LATEST, Version
 
 FRESH_SECONDS = 1.0
@@ -45,6 +46,8 @@ IN_MEMORY = 8 * 2**20
 
 CHUNK = 256 * 2**10
 PRODUCTION = "production"
+OVERLAYS = b"fleetmap-overlays"
+"""Header: digest of the closures in force that a map shows."""
 
 T = TypeVar("T")
 P = ParamSpec("P")
@@ -55,12 +58,15 @@ Key = tuple[bytes, bytes]
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What an address asks for. version: None on a short address. file: None for the whole map."""
+    """What an address asks for. version: None on a short address. file: None for the whole map. closures: None for the
+    default of the address.
+    """
 
     environment: str
     version: str | None
     format: str
     file: str | None
+    closures: ClosureMode | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,8 +114,8 @@ class Hot:
         fresh = self.get(key)
         if fresh is not None and (fresh.body is not None or fresh.path is not None):
             return fresh
-        wanted = wanted_of(request)
-        values, derive = _options(key[1])
+        values, derive, closures = _options(key[1])
+        wanted = replace(wanted_of(request), closures=closures)
         # Taken before anything is read: a commit in between makes this answer stale, never fresh.
         generation, until = self.generation(), time.monotonic() + FRESH_SECONDS
         while True:
@@ -170,13 +176,16 @@ class Hot:
     ) -> Resource:
         version = recipe.version
         etag = recipe.etag if wanted.file is None else _file_etag(recipe, wanted.file)
-        query = urlencode({**values, **({} if derive else {"derive": "false"})})
+        closures = version.closures
+        more = ({} if derive else {"derive": "false"}) | ({} if closures is None else {"closures": closures.mode})
+        query = urlencode({**values, **more})
         report = path_of("environments", version.environment, "versions", version.number, "reports", wanted.format)
         bare = [
             (b"etag", etag.encode()),
             (b"cache-control", b"no-cache"),
             (b"fleetmap-version", str(version.number).encode()),
             (b"fleetmap-root", version.root.encode()),
+            *([] if closures is None else [(OVERLAYS, closures.digest.encode())]),
             (b"vary", b"accept-encoding, available-dictionary"),  # with 304 as well (RFC 9110, 15.4.5)
         ]
         link = f'<{report}{"?" + query if query else ""}>; rel="describedby"'.encode()
@@ -237,9 +246,10 @@ def _file_etag(recipe: Recipe, name: str) -> str:
     return f'{recipe.etag[:-1]}-{hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]}"'
 
 
-def _meant(recipe: Recipe) -> tuple[str, int, str]:
+def _meant(recipe: Recipe) -> tuple[str, int, str, str]:
     """What tells recipes at one address apart."""
-    return recipe.key, recipe.version.number, recipe.version.environment
+    closures = recipe.version.closures
+    return recipe.key, recipe.version.number, recipe.version.environment, closures.digest if closures else ""
 
 
 def _same(a: Recipe, b: Recipe) -> bool:
@@ -257,13 +267,15 @@ def _resolve(here: Services, wanted: Wanted, values: Mapping[str, str], derive: 
 
 
 def version_of(here: Services, wanted: Wanted) -> Version:
-    """The version that an address means: on a short one production where there is one, else the head."""
+    """The version that an address means, with the closures that its maps show: on a short one production where there is
+    one, else the head.
+    """
     if wanted.version is not None:
-        return here.store.version(wanted.environment, number_of(wanted.version))
+        return here.store.standing(wanted.environment, number_of(wanted.version), wanted.closures)[0]
     try:
-        return here.store.version(wanted.environment, PRODUCTION)
+        return here.store.standing(wanted.environment, PRODUCTION, wanted.closures)[0]
     except NotFound:
-        return here.store.version(wanted.environment, LATEST)
+        return here.store.standing(wanted.environment, LATEST, wanted.closures)[0]
 
 
 def number_of(ref: str) -> str | int:
@@ -331,8 +343,10 @@ def address_of(request: Request) -> str:
     return quote(request.scope["path"], safe="/") + (f"?{quote(query, safe='&=%,.:+-_~/')}" if query else "")
 
 
-def _options(query: bytes) -> tuple[dict[str, str], bool]:
-    """The format's options, and whether derived information is allowed. Invalid for what is given twice."""
+def _options(query: bytes) -> tuple[dict[str, str], bool, ClosureMode | None]:
+    """The format's options, whether derived information is allowed, and how closures are shown. Invalid for what is
+    given twice.
+    """
     try:
         pairs = parse_qsl(query.decode("ascii"), keep_blank_values=True, max_num_fields=100, errors="strict")
     except ValueError:
@@ -345,7 +359,18 @@ def _options(query: bytes) -> tuple[dict[str, str], bool]:
     derive = values.pop("derive", "true")
     if derive not in ("true", "false"):
         raise Invalid(f"derive must be true or false, got {derive[:80]!r}", [Problem("true or false", where="derive")])
-    return values, derive == "true"
+    return values, derive == "true", closure_mode(values.pop("closures", None))
+
+
+def closure_mode(text: str | None) -> ClosureMode | None:
+    """The parameter ``closures`` of a map; None for the default of the address. Raises Invalid."""
+    if text is None:
+        return None
+    for mode in CLOSURE_MODES:
+        if mode == text:
+            return mode
+    accepted = ", ".join(CLOSURE_MODES)
+    raise Invalid(f"closures must be one of {accepted}, got {text[:80]!r}", [Problem(accepted, where="closures")])
 
 
 class Server(FastAPI):
@@ -536,8 +561,8 @@ async def report(
     derive: bool = Query(True, description="Whether derived information is allowed."),
 ) -> Response:
     """Raw, derived and filled-in information of a map, what was dropped and why. Takes the map's own parameters."""
-    values, allowed = _options(request.scope["query_string"])
-    wanted = Wanted(env, v, format, None)
+    values, allowed, mode = _options(request.scope["query_string"])
+    wanted = Wanted(env, v, format, None, mode)
     while True:
         recipe = await run_in_threadpool(_resolve, here, wanted, values, allowed and derive)
         if await run_in_threadpool(here.maps.ready, recipe) is not None:

@@ -18,6 +18,7 @@ from app.api.problems import MEDIA_TYPE
 from app.api.schemas import ProblemOut, RevertBody, told
 from app.derive import all_derivations
 from app.errors import NotFound
+from app.model.closures import CLOSURE_MODES
 
 ASSETS = {
     "swagger-ui-bundle.js": "text/javascript",
@@ -198,6 +199,10 @@ _HEADERS: dict[str, Any] = {
     "ETag": {"schema": {"type": "string"}, "description": "Strong: equal tags mean equal bytes."},
     "Fleetmap-Version": {"schema": {"type": "integer"}},
     "Fleetmap-Root": {"schema": {"type": "string"}},
+    "Fleetmap-Overlays": {
+        "schema": {"type": "string"},
+        "description": "Digest of the closures in force that the map shows; absent with `closures=ignore`.",
+    },
     "Link": {"schema": {"type": "string"}, "description": 'The report, `rel="describedby"`.'},
 }
 
@@ -225,7 +230,7 @@ def _path_parameter(name: str) -> dict[str, Any]:
 
 
 def _query_parameters() -> list[dict[str, Any]]:
-    """``derive``, the options of all formats, and the parameters of the derivations on the way to them.
+    """``derive``, ``closures``, the options of all formats, and the parameters of the derivations on the way to them.
 
     One that several have is told once, with what it means for each.
     """
@@ -248,7 +253,14 @@ def _query_parameters() -> list[dict[str, Any]]:
         "description": "`false`: only from information that is stored as it is.",
         "schema": {"type": "boolean", "default": True},
     }
-    return [derive, *(out[name] for name in sorted(out))]
+    closures = {
+        "name": "closures",
+        "in": "query",
+        "description": "How the closures in force are shown: `apply` (closed edges are left out where the format's "
+        "planners know no word for them), `mark` or `ignore`. Default: `apply`, but `ignore` at a version's number.",
+        "schema": {"type": "string", "enum": list(CLOSURE_MODES)},
+    }
+    return [derive, closures, *(out[name] for name in sorted(out))]
 
 
 def _header_parameters() -> list[dict[str, Any]]:

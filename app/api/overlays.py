@@ -1,47 +1,75 @@
-"""Overlays: robots report what is blocked, editors decide on it; each step is an event (``overlay.…``)."""
+"""Overlays: robots report what is blocked, editors decide; what they accept is in force on every channel."""
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import Annotated, Any, Literal
 
 import shapely
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Request
+from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from app.api.access import Editor, Reporter, Viewer
+from app.api.access import Editor, Principal, Reporter, Viewer
 from app.api.answers import Route, answer
-from app.api.schemas import EnvironmentPath, OverlayBody, OverlayOut, OverlayPath, told
+from app.api.jobs import Started, started
+from app.api.manifest import made_for
+from app.api.schemas import (
+    DynamicEdgesOut,
+    EnvironmentPath,
+    LaneRequestsOut,
+    OverlayBody,
+    OverlayOut,
+    OverlayPath,
+    ZoneSetsOut,
+    told,
+)
 from app.api.services import Here, Services
-from app.errors import Conflict, FleetMapError, Invalid, MissingDatum, Problem
-from app.fleet import overlays
-from app.ingest.edits import edit_changes, shape_of
+from app.convert.cache import Made
+from app.errors import Conflict, Denied, FleetMapError, Invalid, MissingDatum, NotFound, Problem
+from app.fleet import live, overlays
+from app.ingest.edits import shape_of
+from app.model.closures import Closures
 from app.model.frame import GROUND
-from app.store.values import Overlay, rfc3339
+from app.store.values import Overlay, Version
 
 log = logging.getLogger(__name__)
 
 MAX_POINTS = 1000
-"""Of a reported polygon: it goes to every robot in an event."""
+"""Maximum number of points of a reported polygon: it goes to every robot in an event."""
+
+DEFAULT_SECONDS = 3600.0
+MAX_SECONDS = 2_592_000.0
 
 router = APIRouter(prefix="/environments/{env}/overlays", tags=["overlays"], route_class=Route)
 
+Ref = Annotated[
+    str | None,
+    Query(
+        pattern=r"^([a-z][a-z0-9_-]{0,62}|\d{1,18})$",
+        description="The version that planners have loaded: a channel or number. Default: `production` if it exists, "
+        "else `latest`.",
+    ),
+]
 
-@router.get("", responses=told(list[OverlayOut], 404), summary="What is reported as blocked")
+
+@router.get("", responses=told(list[OverlayOut], 404), summary="List overlays")
 def list_overlays(
     env: EnvironmentPath,
     here: Here,
     _: Viewer,
     state: Annotated[
-        Literal["pending", "accepted", "rejected", "expired", "ended"] | None,
-        Query(description="Only these; left out: all of the last 30 days."),
+        Literal["pending", "accepted", "rejected", "expired", "ended", "kept"] | None,
+        Query(description="Only these; left out: all of the last 30 days. `accepted` are in force."),
     ] = None,
 ) -> Response:
-    """Oldest first. `pending` waits for a decision, `expired` was never decided on, `ended` was taken out again."""
+    """Oldest first. `pending` waits for a decision, `accepted` is in force on every channel, `expired` was never
+    decided on, `ended` is over, `kept` was made permanent.
+    """
     return answer([overlay.as_dict() for overlay in here.store.overlays(env, state)])
 
 
@@ -49,29 +77,32 @@ def list_overlays(
     "",
     status_code=201,
     responses={
-        **told(OverlayOut, 400, 404, 409, 415, ok=201, description="It waits for a decision"),
+        **told(OverlayOut, 400, 404, 409, 415, ok=201, description="It waits for a decision, or is in force"),
         200: {"model": OverlayOut, "description": "The same was reported before: its end has moved."},
     },
     summary="Report what is blocked",
 )
 def report_overlay(env: EnvironmentPath, body: OverlayBody, here: Here, who: Reporter) -> Response:
-    """A robot (or an editor) says that a polygon or an edge cannot be passed for a time. No map changes by that."""
+    """Report that a polygon or an edge cannot be used until a time. With `state: "accepted"` (editors) it is in force
+    at once, on every channel; otherwise an editor decides.
+    """
     if (body.polygon is None) == (body.edge is None):
         raise Invalid("give polygon or edge, one of them", [Problem("one of polygon and edge", where="body")])
-    head = here.store.version(env)
+    if body.state == "accepted" and who.role not in ("editor", "admin"):
+        raise Denied("only editors can accept an overlay: report it without state, an editor decides")
+    versions = _shown_versions(here, env)
+    head = next(versions)
     now = datetime.now(UTC)
     crs = None if body.polygon is None else body.crs or ("wgs84" if head.datum else "local")
     if crs == "wgs84" and head.datum is None:
-        raise MissingDatum(
-            f"{env} has no datum, so degrees have no place in its maps: give the polygon in local metres"
-        )
+        raise MissingDatum(f"{env} has no datum, so degrees have no place in its maps: give the polygon in metres")
     level = body.level or GROUND
     if body.edge is not None:
-        level = overlays.edge_of(here.store, head, body.edge)[0].level
+        level = overlays.edge_of(here.store, [head, *versions], body.edge)[0].level
     elif level not in (names := [known.name for known in head.levels]):
-        known = ", ".join(names)[:500]
-        raise Invalid(f"{env} has no level {level[:80]!r}; it has {known}", [Problem("no such level", where="level")])
-    wanted = Overlay(
+        listed = ", ".join(names)[:500]
+        raise Invalid(f"{env} has no level {level[:80]!r}; it has {listed}", [Problem("no such level", where="level")])
+    reported = Overlay(
         environment=env,
         kind=body.kind,
         level=level,
@@ -81,17 +112,49 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, here: Here, who: Rep
         detail=body.detail,
         reporter=who.robot or who.name,
         created=now,
-        expires=now + timedelta(seconds=body.ttl_seconds),
+        expires=_end_of(body, now),
+        state=body.state,
+        decided_by=who.name if body.state == "accepted" else None,
+        decided=now if body.state == "accepted" else None,
     )
-    if changes := overlays.accepting(here.store, head, wanted):
-        edit_changes(here.store, head, changes)  # Invalid now, not for the editor
-    overlay, new = here.store.add_overlay(wanted)
+    overlay, new = here.store.add_overlay(reported)
     return answer(overlay.as_dict(), 201 if new else 200)
 
 
+def _end_of(body: OverlayBody, now: datetime) -> datetime:
+    """When a report ends. Raises Invalid."""
+    if body.expires is None:
+        return now + timedelta(seconds=DEFAULT_SECONDS if body.ttl_seconds is None else body.ttl_seconds)
+    problem = ""
+    if body.ttl_seconds is not None:
+        problem = "give expires or ttl_seconds, one of them"
+    elif body.expires.tzinfo is None:
+        problem = "expires needs a time zone, for example 2030-01-31T06:00:00Z"
+    elif body.expires <= now:
+        problem = "expires is in the past: nothing would be blocked"
+    elif body.expires > now + timedelta(seconds=MAX_SECONDS):
+        problem = f"expires is more than {MAX_SECONDS / 86400:g} days ahead: block it by an edit, or for a shorter time"
+    if problem:
+        raise Invalid(problem, [Problem(problem, where="body.expires")])
+    return body.expires
+
+
+def _shown_versions(here: Services, env: str) -> Iterator[Version]:
+    """The newest version, then those that channels stand on: robots report from any of them."""
+    head = here.store.version(env)
+    yield head
+    numbers = {channel.version for channel in here.store.channels(env)} - {None, head.number}
+    for number in sorted((n for n in numbers if n is not None), reverse=True):
+        yield here.store.version(env, number)
+
+
 def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The GeoJSON geometry and nothing else that came with it: all robots are told of it."""
+    """A valid GeoJSON polygon and nothing else that came with it. Raises Invalid."""
     shape = shape_of(given)
+    if shape.geom_type not in ("Polygon", "MultiPolygon") or shape.is_empty or not shape.is_valid:
+        reason = shapely.is_valid_reason(shape)
+        problem = f"must be a valid GeoJSON Polygon or MultiPolygon, got {shape.geom_type}: {reason}"
+        raise Invalid(f"the polygon {problem}", [Problem(problem, where="body.polygon")])
     if (count := int(shapely.get_num_coordinates(shape))) > MAX_POINTS:
         problem = f"has {count} points, at most {MAX_POINTS} are taken: send its outline with fewer"
         raise Invalid(f"the polygon {problem}", [Problem(problem, where="body.polygon")])
@@ -99,27 +162,16 @@ def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
     return clean
 
 
-@router.post(
-    "/{id}/accept", responses=told(OverlayOut, 404, 409, 412, 422, 503), summary="Take an overlay into a version"
-)
+@router.post("/{id}/accept", responses=told(OverlayOut, 404, 409, 422, 503), summary="Accept an overlay")
 def accept_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
-    """A polygon becomes a zone of kind `keepout` with `expires`, an edge gets `blocked` and `blocked_until`: a version.
-    When its time is over it is taken out again, by a version as well.
-    """
+    """It is in force on every channel until its end: areas are keepout, edges are closed. No version changes."""
     now = datetime.now(UTC)
-    known = here.store.overlay(env, id)
-    if known.state == "pending" and known.expires <= now:
-        raise Conflict(f"the overlay {id} has expired")
-    if not (known.state == "accepted" and known.version is None):  # else a crash came between this and the version
-        known = here.store.decide_overlay(env, id, "pending", "accepted", who.name, now)
-    try:
-        version = _edit(here, known, ending=False, author=who.name)
-    except FleetMapError:
-        # It may be in the map all the same: another editor was at it too, or the database's answer was lost.
-        if not overlays.ending(here.store, here.store.version(env), known):
-            here.store.decide_overlay(env, id, "accepted", "pending", who.name, now)
-        raise
-    return answer(here.store.note_overlay_version(env, id, version).as_dict())
+    overlay = here.store.overlay(env, id)
+    if overlay.state == "pending" and overlay.expires <= now:
+        raise Conflict(f"the overlay {id} has expired: report it again")
+    if overlay.state == "pending" and overlay.edge is not None:
+        overlays.edge_of(here.store, _shown_versions(here, env), overlay.edge)
+    return answer(here.store.decide_overlay(env, id, "pending", "accepted", who.name, now).as_dict())
 
 
 @router.post("/{id}/reject", responses=told(OverlayOut, 404, 409), summary="Reject an overlay")
@@ -129,30 +181,154 @@ def reject_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Edito
     return answer(decided.as_dict())
 
 
-def _edit(here: Services, overlay: Overlay, *, ending: bool, author: str) -> int:
-    """The version that an overlay is in, or is out of; the same one where this is done twice."""
-    edits = partial(overlays.ending if ending else overlays.accepting, here.store)
+@router.post("/{id}/end", responses=told(OverlayOut, 404, 409, 503), summary="End an accepted overlay now")
+def end_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
+    """What it closed is free again on every channel."""
+    overlay = here.store.overlay(env, id)
+    if overlay.state == "accepted" and overlay.version is not None:
+        _lift(here, overlay, who.name)
+    return answer(here.store.decide_overlay(env, id, "accepted", "ended", who.name, datetime.now(UTC)).as_dict())
+
+
+@router.post("/{id}/keep", responses=told(OverlayOut, 404, 409, 422, 503), summary="Make an accepted overlay permanent")
+def keep_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
+    """A new version holds it: an area as a keepout zone, an edge with `blocked: true`. Promote that version to bring it
+    to robots for good: the overlay itself ends here.
+    """
+    overlay = here.store.overlay(env, id)
+    if overlay.state != "accepted":
+        raise Conflict(f"the overlay {id} is {overlay.state}: only accepted ones can be kept")
     what = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
-    message = f"{what} is free again" if ending else f"{what} is blocked until {rfc3339(overlay.expires)}"
     outcome = here.ingest.amend(
-        overlay.environment,
-        lambda head: edits(head, overlay),
-        message=f"{message} (reported by {overlay.reporter})",
-        author=author,
+        env,
+        partial(overlays.permanent_edits, here.store, overlay=overlay),
+        message=f"{what} is blocked permanently (reported by {overlay.reporter})",
+        author=who.name,
     )
     assert outcome.version is not None
-    return outcome.version.number
+    number = outcome.version.number
+    kept = here.store.decide_overlay(env, id, "accepted", "kept", who.name, datetime.now(UTC), version=number)
+    return answer(kept.as_dict())
+
+
+def _lift(here: Services, overlay: Overlay, author: str) -> None:
+    """Take an overlay out of the newest version, into which a release before closures put it."""
+    what = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
+    here.ingest.amend(
+        overlay.environment,
+        partial(overlays.lifting_edits, here.store, overlay=overlay),
+        message=f"{what} is free again (reported by {overlay.reporter})",
+        author=author,
+    )
 
 
 def end_overlays(here: Services, now: datetime) -> None:
-    """What is blocked no longer: pending overlays expire, accepted ones are taken out of the map. Blocks."""
-    for overlay in here.store.expire_overlays(now):
+    """End what is due: pending overlays expire, closures are lifted. Blocks."""
+    for overlay in here.store.end_due_overlays(now):
+        author = overlay.decided_by or ""
         try:
-            _edit(here, overlay, ending=True, author=overlay.decided_by or "")
-            here.store.decide_overlay(
-                overlay.environment, overlay.id, "accepted", "ended", overlay.decided_by or "", now
-            )
+            _lift(here, overlay, author)
+            here.store.decide_overlay(overlay.environment, overlay.id, "accepted", "ended", author, now)
         except Conflict:
-            continue  # another process was quicker
+            continue  # another process was faster
         except FleetMapError as error:
-            log.warning("the overlay %s of %s cannot be ended: %s", overlay.id, overlay.environment, error.detail)
+            log.warning("overlays: %s of %s cannot be ended: %s", overlay.id, overlay.environment, error.detail)
+
+
+# --- ready-made for planners that take closures live ---
+
+
+@router.get("/nav2", responses=told(DynamicEdgesOut, 404, 409, 422), summary="Closures for Nav2's route server")
+async def nav2_edges(env: EnvironmentPath, request: Request, here: Here, who: Viewer, version: Ref = None) -> Response:
+    """A request of `nav2_msgs/srv/DynamicEdges`: the numbers of closed edges, and of those that were closed and are
+    open again, in the graph that `maps/nav2_route?closures=ignore` (or `mark`) gives.
+    """
+    maps = await _marked(here, env, version, "nav2_route", request, who)
+    if isinstance(maps, Started):
+        return started(maps.job)
+    now, before = (live.closed_edges(files) for files in maps)
+    return answer({"closed_edges": now, "opened_edges": sorted(set(before) - set(now))})
+
+
+@router.get("/rmf", responses=told(LaneRequestsOut, 404, 409, 422), summary="Closures for Open-RMF's fleet adapters")
+async def rmf_lanes(
+    env: EnvironmentPath,
+    request: Request,
+    here: Here,
+    who: Viewer,
+    version: Ref = None,
+    fleet: Annotated[str, Query(max_length=256, description="`fleet_name` of the messages.")] = "",
+) -> Response:
+    """Messages of `rmf_fleet_msgs/msg/LaneRequest`, one for each graph: lanes to close, and lanes that were closed and
+    are open again, by their indexes in the graphs that `maps/rmf_nav_graph?closures=ignore` (or `mark`) gives.
+    """
+    maps = await _marked(here, env, version, "rmf_nav_graph", request, who)
+    if isinstance(maps, Started):
+        return started(maps.job)
+    now, before = (live.closed_lanes(files) for files in maps)
+    messages = [
+        {
+            "graph": name,
+            "message": {
+                "fleet_name": fleet,
+                "open_lanes": sorted(set(before.get(name, ())) - set(lanes)),
+                "close_lanes": lanes,
+            },
+        }
+        for name, lanes in sorted(now.items())
+    ]
+    return answer({"requests": messages})
+
+
+@router.get("/vda5050", responses=told(ZoneSetsOut, 404, 409, 422), summary="Closures for VDA 5050 fleet managers")
+def vda5050_zones(
+    env: EnvironmentPath,
+    here: Here,
+    _: Viewer,
+    version: Ref = None,
+    map_id: Annotated[
+        str | None,
+        Query(alias="mapId", min_length=1, max_length=256, description="What the fleet manager calls the map."),
+    ] = None,
+) -> Response:
+    """Zone sets of VDA 5050 3.0 with a `BLOCKED` zone for each closed area, one set for each level, and the closed
+    edges by id, for the fleet manager's own routing. A set's id changes with its content.
+    """
+    shown = _shown(here, env, version)
+    closures = shown.closures or Closures()
+    return answer(
+        {
+            "zoneSets": live.zone_sets(shown, closures, map_id or env),
+            "closedEdges": [{"edgeId": c.edge, "until": c.expires} for c in closures.items if c.edge is not None],
+        }
+    )
+
+
+def _shown(here: Services, env: str, ref: str | None) -> Version:
+    """The version that planners have loaded, with the closures in force. Raises NotFound."""
+    refs: list[str | int] = ["production", "latest"] if ref is None else [int(ref) if ref.isdigit() else ref]
+    for name in refs[:-1]:
+        try:
+            return here.store.standing(env, name, "mark")[0]
+        except NotFound:
+            continue
+    return here.store.standing(env, refs[-1], "mark")[0]
+
+
+async def _marked(
+    here: Services, env: str, ref: str | None, name: str, request: Request, who: Principal
+) -> list[dict[str, bytes]] | Started:
+    """A map's files twice, with marks: of the closures in force, and of those that ended."""
+    shown = await run_in_threadpool(_shown, here, env, ref)
+    ended = [o for o in await run_in_threadpool(here.store.overlays, env) if o.state == "ended"]
+    out = []
+    for closures in (shown.closures, Closures(tuple(o.closure for o in ended), "mark")):
+        made = await made_for(here, live.with_closures(shown, closures), name, {}, request, who)
+        if isinstance(made, Started):
+            return made
+        out.append(await run_in_threadpool(_files, made))
+    return out
+
+
+def _files(made: Made) -> dict[str, bytes]:
+    return {file.name: file.path.read_bytes() for file in made.files}

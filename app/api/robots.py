@@ -17,7 +17,7 @@ from app.api.answers import Route, answer, page
 from app.api.schemas import CHANNEL, NAME, Cursor, Limit, RobotDetailOut, RobotOut, RobotPath, StatusBody, told
 from app.api.services import Here, Services
 from app.errors import Denied, Invalid, NotFound, Problem
-from app.store.values import Channel, Heard, Move, Report, Robot, rfc3339
+from app.store.values import Channel, Heard, Held, Move, Report, Robot, rfc3339
 
 router = APIRouter(prefix="/robots", tags=["robots"], route_class=Route)
 
@@ -90,7 +90,9 @@ async def put_status(
     who.enter(body.environment)
     if body.time is not None and body.time.tzinfo is None:
         raise Invalid("time needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="body.time")])
-    report = Report(body.channel, body.version, body.root, body.state, body.detail, body.sequence, body.time)
+    report = Report(
+        body.channel, body.version, body.root, body.state, body.detail, body.sequence, body.time, body.overlays
+    )
     # No thread waits for the store: a whole fleet reports at once, and others want maps meanwhile.
     noting = here.fleet.noting(Heard(body.environment, robot, report, datetime.now(UTC)))
     await asyncio.wait({asyncio.wrap_future(noting)}, timeout=fleet.NOTE_SECONDS)
@@ -146,7 +148,9 @@ def _told(here: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
             if robot.environment not in channels:
                 channels[robot.environment] = {c.name: c for c in here.store.channels(robot.environment)}
             channel = channels[robot.environment].get(name)
-            behind = channel is not None and (robot.held is None or robot.held.root != channel.root)
+            behind = channel is not None and (
+                robot.held is None or not robot.held.shows(channel.root, channel.closures.digest)
+            )
             if behind and (robot.environment, name) not in moves:
                 moves[robot.environment, name] = here.store.moves(robot.environment, name)
         except NotFound:
@@ -159,12 +163,17 @@ def _told(here: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
         body |= {
             "received": rfc3339(robot.time),
             "since": rfc3339(robot.since),
-            "holds": held and {"version": held.version, "root": held.root, "since": rfc3339(held.since)},
+            "holds": held and _held(held),
             "online": fleet.is_online(robot, now),
             "lag": lag,
         }
         out.append(body)
     return out
+
+
+def _held(held: Held) -> dict[str, Any]:
+    overlays = {} if held.overlays is None else {"overlays": held.overlays}
+    return {"version": held.version, "root": held.root, **overlays, "since": rfc3339(held.since)}
 
 
 def _report(report: Report, heard: datetime) -> dict[str, Any]:
@@ -178,4 +187,6 @@ def _report(report: Report, heard: datetime) -> dict[str, Any]:
         body["detail"] = report.detail
     if report.sequence is not None:
         body["sequence"] = report.sequence
+    if report.overlays is not None:
+        body["overlays"] = report.overlays
     return body | {"time": rfc3339(report.said or heard)}

@@ -22,7 +22,7 @@ PAGE = 1000
 
 
 def standing(here: Services, chosen: tuple[Chosen, ...], channel: str) -> dict[str, Version]:
-    """The chosen environments that there are, each with the version that the channel stands on.
+    """The chosen environments that there are, each with the version and closures that the channel shows.
 
     channel: empty for production where there is one, else the latest. Where it stands nowhere, nothing goes out.
     """
@@ -33,7 +33,7 @@ def standing(here: Services, chosen: tuple[Chosen, ...], channel: str) -> dict[s
     for name in dict.fromkeys(names):
         for ref in [channel] if channel else [PRODUCTION, LATEST]:
             try:
-                out[name] = here.store.version(name, ref)
+                out[name], _ = here.store.standing(name, ref)
                 break
             except NotFound:
                 continue

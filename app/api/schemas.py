@@ -12,6 +12,7 @@ from fastapi import Header, Path, Query
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from app.api.problems import MEDIA_TYPE
+from app.model.closures import ClosureMode
 from app.model.frame import MAX_DATUM_LATITUDE
 
 NAME = r"^[a-z0-9][a-z0-9_-]{0,62}$"
@@ -385,6 +386,9 @@ class StatusBody(In):
     detail: str | None = Field(None, max_length=2000)
     time: Moment | None = Field(None, description="RFC 3339 time with zone, by the robot's clock.")
     sequence: int | None = Field(None, ge=0, lt=2**63, description="Of the last event that it has processed.")
+    overlays: str | None = Field(
+        None, pattern=r"^[0-9a-f]{64}$", description="Digest of the closures in its map, as the manifest gives it."
+    )
 
 
 class OverlayBody(In):
@@ -418,7 +422,16 @@ class OverlayBody(In):
         None, description="What the polygon is in; default: wgs84 where there is a datum."
     )
     level: str | None = Field(None, min_length=1, max_length=256, description="Of the polygon; default: `ground`.")
-    ttl_seconds: float = Field(3600.0, ge=1, le=2_592_000, description="How long it will be blocked, from now on.")
+    ttl_seconds: float | None = Field(
+        None,
+        ge=1,
+        le=2_592_000,
+        description="How long it is blocked from now on; default: 3600 unless `expires` is given.",
+    )
+    expires: Moment | None = Field(None, description="When it ends instead, an RFC 3339 time with zone.")
+    state: Literal["pending", "accepted"] = Field(
+        "pending", description="`accepted` (editors only): in force at once, on every channel."
+    )
     detail: str | None = Field(None, max_length=2000)
 
 
@@ -570,6 +583,9 @@ class ReportOut(BaseModel):
     )
     dropped: list[dict[str, Any]]
     warnings: list[ProblemItem]
+    closures: list[dict[str, Any]] = Field(
+        description="Each closure in force with its `effect` on this map, and the `edges` that it closes."
+    )
 
 
 class TemplateSetOut(BaseModel):
@@ -637,6 +653,14 @@ class RolloutOut(BaseModel):
     detail: str
 
 
+class OverlaysOut(BaseModel):
+    """The closures in force."""
+
+    count: int
+    digest: str = Field(description="Robots with equal roots and equal digests hold the same map.")
+    sequence: int = Field(description="Of the last event that changed them; 0: none did.")
+
+
 class ChannelOut(BaseModel):
     """A movable name for a version."""
 
@@ -644,6 +668,7 @@ class ChannelOut(BaseModel):
     version: int | None
     root: str | None
     sequence: int
+    overlays: OverlaysOut = Field(description="The closures in force, the same on all channels.")
     author: str
     time: datetime
     planned: dict[str, Any] | None = None
@@ -664,6 +689,7 @@ class HoldsOut(BaseModel):
 
     version: int
     root: str
+    overlays: str | None = Field(None, description="Digest of the closures in it.")
     since: datetime
 
 
@@ -680,6 +706,7 @@ class RobotOut(BaseModel):
     state: Literal["downloading", "ready", "active", "failed"]
     detail: str | None = None
     sequence: int | None = None
+    overlays: str | None = None
     time: datetime
     received: datetime
     since: datetime
@@ -778,11 +805,15 @@ class ManifestOut(BaseModel):
 
     environment: str
     channel: str | None = None
+    epoch: int = Field(description="Rises when the server is restored from a backup. Order is by epoch, then sequence.")
     sequence: int
     version: int
     root: str
+    time: datetime = Field(description="When it was signed, in steps of ten minutes.")
     expires: datetime
     files: list[ManifestFile]
+    overlays: list[dict[str, Any]] = Field(description="The closures in force that its files show, by id.")
+    overlays_digest: str = Field(description="SHA-256 of that list; `Fleetmap-Overlays` of each file.")
     layers: dict[str, str] = Field(description="A hash of each layer: equal where the layer is, in any two versions.")
     variables: dict[str, str] | None = Field(
         None, description="What the place is called: literal variables of an environment_template's scripts."
@@ -836,7 +867,7 @@ class OverlayOut(BaseModel):
     id: str
     environment: str
     kind: Literal["blocked"]
-    state: Literal["pending", "accepted", "rejected", "expired", "ended"]
+    state: Literal["pending", "accepted", "rejected", "expired", "ended", "kept"]
     level: str
     reporter: str
     created: datetime
@@ -847,7 +878,44 @@ class OverlayOut(BaseModel):
     detail: str | None = None
     decided_by: str | None = None
     decided: datetime | None = None
-    version: int | None = Field(None, description="That an accepted one went into.")
+    version: int | None = Field(None, description="That made it permanent.")
+
+
+class DynamicEdgesOut(BaseModel):
+    """A request of `nav2_msgs/srv/DynamicEdges`."""
+
+    closed_edges: list[int]
+    opened_edges: list[int]
+
+
+class LaneRequestOut(BaseModel):
+    """A message of `rmf_fleet_msgs/msg/LaneRequest`."""
+
+    fleet_name: str
+    open_lanes: list[int]
+    close_lanes: list[int]
+
+
+class GraphLanesOut(BaseModel):
+    """What to publish for one navigation graph."""
+
+    graph: str = Field(description="The graph's file, `0.yaml` …")
+    message: LaneRequestOut
+
+
+class LaneRequestsOut(BaseModel):
+    """One message for each navigation graph."""
+
+    requests: list[GraphLanesOut]
+
+
+class ZoneSetsOut(BaseModel):
+    """Closures in the words of VDA 5050 3.0."""
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    zone_sets: list[dict[str, Any]] = Field(alias="zoneSets")
+    closed_edges: list[dict[str, Any]] = Field(alias="closedEdges")
 
 
 class ActionsOut(BaseModel):
@@ -912,6 +980,13 @@ FormatPath = Annotated[
 JobPath = Annotated[str, Path(max_length=100, description="A job's id.")]
 OverlayPath = Annotated[str, Path(max_length=100, description="An overlay's id.")]
 TokenPath = Annotated[str, Path(max_length=100, description="A token's id.")]
+Closing = Annotated[
+    ClosureMode | None,
+    Query(
+        description="How maps show the closures in force: `apply` (closed edges are left out where the format's "
+        "planners know no word for them), `mark` or `ignore`. Default: `apply`, but `ignore` for a version's number."
+    ),
+]
 LayerPath = Annotated[
     Literal["location", "objects", "topology", "occupancy", "voxels", "imagery", "zones"],
     Path(description="A layer.", examples=["topology"]),

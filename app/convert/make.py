@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from app import derive, formats
+from app.convert import closures as closing
 from app.convert import recipe as recipes
 from app.convert.recipe import Chain, Hindrance
 from app.derive import Step
 from app.errors import CannotDerive, FleetMapError, MissingLayer, Problem
 from app.formats import Format, Inner, WriteContext, _archive
+from app.model.closures import Closures
 from app.model.features import Features
 from app.model.frame import GROUND
 from app.model.layers import LAYERS, VECTOR_LAYERS, Layer, Layers, PartKey
@@ -44,17 +46,16 @@ def make(
     """In a worker: a stored version's map. The parts are addressed by content, so no later change can mix in."""
     store = open_store(database_url, blob_dir)
     known = formats.get_format(name)
-    loaded = store.load(version, way.keys)
-    layers = Layers(loaded.parts, version.datum, version.levels)
+    layers = closing.load(store, version, way.keys)
     entries = {e.key: e for e in version.parts}
-    return write(known, layers, values, way, entries, templates=version.templates)
+    return write(known, layers, values, way, entries, templates=version.templates, closures=version.closures)
 
 
 def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) -> Hindrance | None:
     """In a worker: the step of a chain that fails on a version's content and why, or None where all work."""
-    loaded = open_store(database_url, blob_dir).load(version, way.keys)
+    layers = closing.load(open_store(database_url, blob_dir), version, way.keys)
     try:
-        derive.run(way.steps, Layers(loaded.parts, version.datum, version.levels))
+        derive.run(way.steps, layers)
     except CannotDerive as error:
         return Hindrance(error.step, error.detail, error.choose)
     except FleetMapError as error:
@@ -65,9 +66,9 @@ def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) ->
 def lacking(database_url: str, blob_dir: str, version: Version, name: str, way: Chain) -> Hindrance | None:
     """In a worker: what a format wants of its layers besides that they are there, and they do not have, or None."""
     known = formats.get_format(name)
-    loaded = open_store(database_url, blob_dir).load(version, way.keys)
+    layers = closing.load(open_store(database_url, blob_dir), version, way.keys)
     try:
-        made = derive.run(way.steps, Layers(loaded.parts, version.datum, version.levels))
+        made = derive.run(way.steps, layers)
     except FleetMapError as error:
         return Hindrance("", error.detail)
     reason = known.lacks(made) if known.lacks is not None else None
@@ -83,22 +84,27 @@ def write(
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None = None,
     credit: Mapping[PartKey, Sequence[str]] | None = None,
     templates: Templates = NO_TEMPLATES,
+    closures: Closures | None = None,
 ) -> Written:
     """Derive and write. ``entries`` (of a stored version) or ``origin`` and ``credit`` (of files) say where each part
-    came from, and under which licences and credits. templates: for the maps that a format holds."""
+    came from, and under which licences and credits. templates: for the maps that a format holds. closures: to apply.
+    """
     notes = derive.Notes()
     made = derive.run(way.steps, layers, notes)
     context = WriteContext(options=recipes.own_options(known, values))
     inner: list[dict[str, Any]] = []
     if known.holds:
-        context.make = partial(_inner, entries, origin, credit, templates, inner)
+        context.make = partial(_inner, entries, origin, credit, templates, closures, inner)
     chosen = known.choose(sorted(k for k in made.parts if k.layer in known.carries), context.options)
     used = Layers({k: made.parts[k] for k in chosen}, made.datum, made.levels)
+    closed = closing.ClosureReport()
+    if not known.holds:  # a folder's inner maps apply closures themselves
+        used, closed = closing.close(known, used, closures, made.parts.keys() - layers.parts.keys())
     noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
     lines = _told(used, layers, way, entries or {}, origin or {}, noted)
     context.attribution = tuple(sorted(credits_of(lines)))  # whichever part came first: equal content, equal bytes
     files = formats.write(known, used, context)
-    _warn_of_blocked(known, used, context)
+    _report_blocked(known, closed, context)
     known_lines = {(line["layer"], line["level"], line["name"]) for line in lines}
     lines += [line for line in inner if (line["layer"], line["level"], line["name"]) not in known_lines]
     report = {
@@ -109,27 +115,18 @@ def write(
         # What a stored version holds beside this map is not part of the recipe's key: ``Maps.report`` adds it.
         "dropped": notes.dropped + context.dropped + (not_carried(known, None, layers) if entries is None else []),
         "warnings": [p.as_dict() for p in notes.warnings + context.warnings],
+        "closures": closed.lines,
     }
     return Written(files, report)
 
 
-UNPLANNED = frozenset({"geojson", "kml", "kmz"})
-"""Formats that people and programs look at, and no robot plans on: they say that an edge is blocked."""
-
-
-def _warn_of_blocked(known: Format, used: Layers, context: WriteContext) -> None:
-    """Say that a blocked edge is open to whoever plans on this map: no format's planner reads of such an edge.
-
-    (RMF's and Nav2's close lanes at run time, by a message to the fleet adapter or the route server.)
-    """
-    if known.holds or known.name in UNPLANNED:  # a folder's inner maps say it themselves
-        return
-    networks = used.vector("topology").values()
-    blocked = sum(p.get("kind") == "edge" and p.get("blocked") is True for part in networks for p in part.properties)
-    if blocked:
+def _report_blocked(known: Format, closed: closing.ClosureReport, context: WriteContext) -> None:
+    """Report edges that nobody may use: those left out, and those that stay open to who plans on this map."""
+    context.drop("blocked edges", closed.left_out, f"nobody may use them, and {known.name} has no word for that")
+    if closed.kept:
         context.warn(
-            f"{blocked} edges are blocked for the time being, and {known.name} has no word for it that planners obey: "
-            "robots that plan on this map must be told of them otherwise"
+            f"{closed.kept} edges are blocked and stay in this map, because it was requested with closures=mark; "
+            f"planners of {known.name} use them unless they are told otherwise"
         )
 
 
@@ -142,6 +139,7 @@ def from_layers(
     entries: Mapping[PartKey, PartEntry] | None = None,
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None = None,
     credit: Mapping[PartKey, Sequence[str]] | None = None,
+    closures: Closures | None = None,
 ) -> Written:
     """A map by the cheapest way that works on these layers. Raises what planning, deriving and writing raise."""
     own = recipes.own_options(known, asked)
@@ -155,7 +153,7 @@ def from_layers(
             raise recipes.exhausted(error, failed) from error
         kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
         try:
-            return write(known, kept, asked, way, entries, origin, credit)
+            return write(known, kept, asked, way, entries, origin, credit, closures=closures)
         except CannotDerive as error:
             without |= {error.step}
             failed.append(Hindrance(error.step, error.detail, error.choose))
@@ -166,6 +164,7 @@ def _inner(
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None,
     credit: Mapping[PartKey, Sequence[str]] | None,
     templates: Templates,
+    closures: Closures | None,
     derivations: list[dict[str, Any]],
     name: str,
     layers: Layers,
@@ -175,7 +174,9 @@ def _inner(
     """What ``WriteContext.make`` does; layers that were derived on the way are noted in ``derivations``."""
     known = formats.get_format(name)
     asked = {**resolve(templates, known).values, **values}
-    made = from_layers(known, layers, asked, derived=derived, entries=entries, origin=origin, credit=credit)
+    made = from_layers(
+        known, layers, asked, derived=derived, entries=entries, origin=origin, credit=credit, closures=closures
+    )
     report = made.report
     derivations += [line for line in report["layers"] if line["information"] == "derived"]
     return Inner(

@@ -10,6 +10,7 @@ from typing import Any
 
 from app import formats, parameters, templates
 from app.bundle import Hints
+from app.convert import closures as closing
 from app.convert import files as direct
 from app.convert import make as making
 from app.convert import recipe as recipes
@@ -64,6 +65,7 @@ class Maps:
         values: what the request says; the environment's templates say the rest. file: the one file of the map that is
         wanted; its name may say more (``keepout.yaml`` is the grid keepout).
         """
+        version = closing.with_areas(version)
         known = formats.get_format(name)
         said = {**(known.by_file(file) if file else {}), **(values or {})}
         filled = templates.resolve(version.templates, known)

@@ -15,6 +15,7 @@ from typing import Any
 import orjson
 
 from app import __version__, derive, formats, parameters, templates
+from app.convert import closures as closing
 from app.derive import Step
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingDatum, MissingLayer, Problem
 from app.formats import Format
@@ -337,6 +338,7 @@ def _key(version: Version, known: Format, options: Any, way: Chain, entries: Map
         "datum": version.datum.as_dict() if version.datum else None,
         "levels": [[level.name, level.elevation] for level in version.levels],
     }
+    ingredients |= closing.ingredients(version, known, way.keys)
     if known.holds:  # its bytes are those of other writers and, where they lack a layer, of derivations
         ingredients["formats"] = [[f.name, f.version] for f in formats.all_formats().values()]
         ingredients["derivations"] = [[d.name, d.version] for d in derive.all_derivations().values()]

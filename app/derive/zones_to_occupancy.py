@@ -148,7 +148,7 @@ def _zones(layers: Layers, level: str, notes: Notes) -> list[_Zone]:
             elif shapely.get_dimensions(zone.shape) < 2 or zone.shape.is_empty:
                 flat += 1
             else:
-                expiring += p.get("expires") is not None
+                expiring += p.get("expires") is not None and "overlay" not in p  # a closure ends by itself
                 out.append(zone)
     notes.drop("zones of other kinds", other, "masks say keepout, preferred lanes and speed limits only")
     notes.drop("zones without an area", flat, "they are no polygons")

@@ -133,9 +133,11 @@ class _Out:
 
 @dataclass(slots=True)
 class _Place:
-    """An environment: the root that was told, and its topics by name. retry: when it is told again after a failure."""
+    """An environment: root and closures' digest that were published, and its topics by name. retry: when it is
+    published again after a failure.
+    """
 
-    root: str = ""
+    shown: tuple[str, str] = ("", "")
     topics: dict[str, _Out] = field(default_factory=dict)
     retry: float | None = None
 
@@ -214,9 +216,10 @@ class Ros2(Single):
                 return
             place = self._places.setdefault(name, _Place())
             waits = place.retry is not None and time.monotonic() < place.retry
-            if place.root == version.root and (place.retry is None or waits):
+            shown = (version.root, version.closures.digest if version.closures else "")
+            if place.shown == shown and (place.retry is None or waits):
                 continue
-            place.root, place.retry = version.root, None
+            place.shown, place.retry = shown, None
             try:
                 content = self._fetch(version)
             except Exception as error:  # one environment's trouble is not the others'

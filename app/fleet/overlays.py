@@ -1,13 +1,9 @@
-"""Overlays as edits: a blocked polygon becomes a keepout zone, a blocked edge says so of itself, both until their time.
-
-What is put for an overlay is taken out again when its time is over, each by a version.
-"""
+"""Overlays as edits of a version: making a closure permanent, and undoing what releases before closures wrote."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from datetime import datetime
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import shapely
@@ -16,70 +12,63 @@ from app.errors import Invalid, Problem
 from app.model.features import Feature
 from app.model.layers import PartKey
 from app.store import Store
+from app.store.overlays import zone_id
 from app.store.values import Overlay, Version, rfc3339
 
 BLOCKED, UNTIL = "blocked", "blocked_until"
 
 
-def accepting(store: Store, head: Version, overlay: Overlay) -> list[dict[str, Any]]:
-    """The edits that put an overlay into a version; none where the edge is blocked for as long already. Raises Invalid
-    where its edge is not there.
-    """
+def permanent_edits(store: Store, head: Version, overlay: Overlay) -> list[dict[str, Any]]:
+    """Edits that make a closure permanent; none if the edge is blocked already. Raises Invalid for an unknown edge."""
     if overlay.edge is not None:
-        key, edge = edge_of(store, head, overlay.edge)
-        if _blocked(edge, overlay.expires):
+        key, edge = edge_of(store, [head], overlay.edge)
+        if edge.properties.get(BLOCKED) is True and UNTIL not in edge.properties:
             return []
-        return [_put(key, edge, {**edge.properties, BLOCKED: True, UNTIL: rfc3339(overlay.expires)})]
+        kept = {name: value for name, value in edge.properties.items() if name != UNTIL}
+        return [_put(key, edge, {**kept, BLOCKED: True})]
     about = {"id": overlay.id, "reporter": overlay.reporter}
-    properties: dict[str, Any] = {"kind": "keepout", "expires": rfc3339(overlay.expires), "overlay": about}
     if overlay.detail:
         about["detail"] = overlay.detail
-    feature = {"type": "Feature", "id": zone_of(overlay), "geometry": overlay.polygon, "properties": properties}
+    properties = {"kind": "keepout", "overlay": about}
+    feature = {"type": "Feature", "id": zone_id(overlay.id), "geometry": overlay.polygon, "properties": properties}
     return [{"op": "put", "layer": "zones", "level": overlay.level, "crs": overlay.crs, "feature": feature}]
 
 
-def ending(store: Store, head: Version, overlay: Overlay) -> list[dict[str, Any]]:
-    """The edits that take it out again; none where somebody has done so, or has blocked the edge for longer."""
+def lifting_edits(store: Store, head: Version, overlay: Overlay) -> list[dict[str, Any]]:
+    """Edits that take an overlay out of the newest version, into which a release before closures put it.
+
+    None if that is done already, or the edge is blocked for longer.
+    """
     if overlay.edge is not None:
         try:
-            key, edge = edge_of(store, head, overlay.edge)
+            key, edge = edge_of(store, [head], overlay.edge)
         except Invalid:
             return []
         if edge.properties.get(UNTIL) != rfc3339(overlay.expires):
             return []
         return [_put(key, edge, {k: v for k, v in edge.properties.items() if k not in (BLOCKED, UNTIL)})]
-    zone = zone_of(overlay)
+    zone = zone_id(overlay.id)
     keys = [e.key for e in head.parts if e.key.layer == "zones" and store.has_ids(head, e.key, [zone])]
     return [{"op": "delete", "layer": "zones", "level": k.level, "name": k.name, "id": zone} for k in keys]
 
 
-def zone_of(overlay: Overlay) -> str:
-    """The id of its zone."""
-    return f"overlay-{overlay.id}"
-
-
-def edge_of(store: Store, head: Version, edge: str) -> tuple[PartKey, Feature]:
-    """An edge of a version and the network it is in; Invalid where there is none."""
-    for entry in head.parts:
-        if entry.key.layer == "topology":
-            for found in store.get(head, entry.key, [edge]):
-                if found.properties.get("kind") == "edge":
-                    return entry.key, found
+def edge_of(store: Store, versions: Iterable[Version], edge: str) -> tuple[PartKey, Feature]:
+    """Find an edge and its network in the first of these versions that has it. Raises Invalid if none has."""
+    numbers = []
+    environment = ""
+    for version in versions:
+        environment = version.environment
+        numbers.append(str(version.number))
+        for entry in version.parts:
+            if entry.key.layer == "topology":
+                for found in store.get(version, entry.key, [edge]):
+                    if found.properties.get("kind") == "edge":
+                        return entry.key, found
     raise Invalid(
-        f"{head.environment} has no edge {edge[:80]!r} in version {head.number}",
+        f"{environment} has no edge {edge[:80]!r} in version {' or '.join(numbers)}: use an edge's id, as "
+        "GET …/layers/topology lists it",
         [Problem("no such edge", where="edge")],
     )
-
-
-def _blocked(edge: Feature, until: datetime) -> bool:
-    """Whether an edge is blocked until a time, or later: by an overlay, or by an editor without an end."""
-    if edge.properties.get(BLOCKED) is not True:
-        return False
-    try:
-        end = datetime.fromisoformat(edge.properties[UNTIL])
-    except (KeyError, TypeError, ValueError):
-        return UNTIL not in edge.properties
-    return end.tzinfo is not None and end >= until
 
 
 def _put(key: PartKey, edge: Feature, properties: Mapping[str, Any]) -> dict[str, Any]:

@@ -33,7 +33,8 @@ def is_online(robot: Robot, now: datetime) -> bool:
 class Lag:
     """How far a robot is behind its channel.
 
-    events: of its channel that it has not acted on. differs: whether its root is not the channel's. since: when the
+    events: of its channel that it has not acted on. differs: whether its root, or the closures in its map, are not the
+    channel's. since: when the
     first of these events was; None where it does not lag.
     """
 
@@ -56,7 +57,7 @@ def lag_of(robot: Robot, channel: Channel, moves: Sequence[Move]) -> Lag:
     A robot that says no sequence has acted on the newest move that led to the root which it holds.
     """
     held = robot.held
-    if held is not None and held.root == channel.root:
+    if held is not None and held.shows(channel.root, channel.closures.digest):
         return Lag(0, False, None)
     acted = 0
     if held is not None:
@@ -70,8 +71,8 @@ def lag_of(robot: Robot, channel: Channel, moves: Sequence[Move]) -> Lag:
 class Holding:
     """How a channel's robots stand: each is one of holding, failed and lagging.
 
-    holding: drive on the channel's root. failed: do not, and say that they failed. ready: have the version that is
-    planned. since: from when on all of them hold the root; None while any does not.
+    holding: drive on the channel's root with the closures in force. failed: do not, and say that they failed. ready:
+    have the version that is planned. since: from when on all of them hold the root; None while any does not.
     """
 
     total: int
@@ -104,8 +105,13 @@ def is_ready(robot: Robot, root: str) -> bool:
 def holding(robots: Iterable[Robot], channel: Channel, now: datetime, planned: str | None = None) -> Holding:
     """The proof of convergence of one channel. robots: of its environment; planned: root of what comes next."""
     own = [robot for robot in robots if robot.report.channel == channel.name]
-    hold = [robot.held.since for robot in own if robot.held is not None and robot.held.root == channel.root]
-    behind = [robot for robot in own if robot.held is None or robot.held.root != channel.root]
+    overlays = channel.closures.digest
+    hold, behind = [], []
+    for robot in own:
+        if robot.held is not None and robot.held.shows(channel.root, overlays):
+            hold.append(robot.held.since)
+        else:
+            behind.append(robot)
     failed = sum(robot.report.state == "failed" for robot in behind)
     return Holding(
         total=len(own),

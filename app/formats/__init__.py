@@ -176,7 +176,8 @@ class Format:
     those is a main file itself. lacking: what a file needs that may be such a map but does not say enough by itself (a
     picture without a place); empty for other files. completing: the read options that say it.
     looks_at: files of other maps of the upload that it looks into. named: the part (layer, name) that these options
-    ask for by name, if they do. holds: it is a folder of other formats' maps.
+    ask for by name, if they do. holds: it is a folder of other formats' maps. marks_blocked: who reads it knows a word
+    for an edge that nobody may use, so that such an edge stays in it; other formats leave it out.
     """
 
     name: str
@@ -209,6 +210,7 @@ class Format:
     yields: Callable[[str], bool] = lambda name: False
     lacking: Callable[[str, bytes], str] = lambda name, data: ""
     completing: frozenset[str] = frozenset()
+    marks_blocked: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -707,6 +707,7 @@ register(
         write=write,
         needs=Needs(tuple(frozenset({layer}) for layer in ("objects", "topology", "location", "zones"))),
         family=FAMILY,
+        marks_blocked=True,
         drawing=True,
         rank=5,
         extensions=(".geojson", ".json"),

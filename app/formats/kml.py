@@ -52,6 +52,7 @@ register(
         write=write,
         needs=NEEDS,
         family=FAMILY,
+        marks_blocked=True,
         drawing=True,
         outlines=True,
         rank=10,

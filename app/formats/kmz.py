@@ -82,6 +82,7 @@ register(
         write=write,
         needs=NEEDS,
         family=FAMILY,
+        marks_blocked=True,
         drawing=True,
         rank=11,
         extensions=(".kmz",),

@@ -457,6 +457,8 @@ class _Writer:
                 out[word] = float(value) if word in NUMBERS else value
         if out.get("name") == number:
             del out["name"]
+        if p.get("blocked") is True:
+            out["blocked"] = True
         return out
 
     def _shape(self, edge: Edge) -> dict[str, Any]:

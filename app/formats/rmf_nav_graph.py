@@ -529,8 +529,9 @@ class _Writer:
                     out.setdefault(graph, []).append(_Edge(i, source, target, p))
         for edges in out.values():
             edges.sort(key=lambda e: e.order)
+            apart = {frozenset((e.source, e.target)) for e in edges if e.p.get("blocked") is True}
             for e, paired in zip(edges, _paired(edges, len(places)), strict=True):
-                e.paired = paired
+                e.paired = paired and frozenset((e.source, e.target)) not in apart
         return out
 
     # a graph
@@ -605,6 +606,8 @@ class _Writer:
                 continue  # it is told by the lane that says is_bidirectional
             more = "".join(f", {self.flow(v)}" for v in own(e.p, NAME).get("more") or ())
             said = self._lane(storey, e, crossed[n])
+            if e.p.get("blocked") is True:
+                said["blocked"] = True
             yield f"      - [{place[e.source]}, {place[e.target]}, {self.flow(said)}{more}]\n"
         for row in mapping(storey.document.get("dangling"), "dangling").get(str(graph), ()):
             if all(0 <= v < len(place) for v in row[:2]):

@@ -134,27 +134,42 @@ class _Session:
         {"put": self._put, "delete": self._delete, "cells": self._cells}[operation](change)
 
     def dangling(self) -> list[Problem]:
-        """Edges that would start or end at a node that is not there."""
+        """Edges that these edits leave without a node at one end. A lift's edge may end in another level's network.
+
+        What dangled before is not this edit's: it was warned of when it came.
+        """
         out = []
         for key, draft in self._drafts.items():
             if key.layer != "topology":
                 continue
-            rows: dict[str, Properties] = {}
-            if draft.stored is not None:
-                rows.update(zip(draft.stored.ids, draft.stored.properties, strict=True))
-            rows = {i: p for i, p in rows.items() if i not in draft.deletes}
-            rows.update({i: p for i, (_, p, _) in draft.puts.items()})
-            nodes = {i for i, p in rows.items() if p.get("kind") == "node"}
-            for item, p in rows.items():
-                if p.get("kind") != "edge":
+            put = {i for i, (_, p, _) in draft.puts.items() if p.get("kind") == "edge"}
+            cut = {i for node in draft.deletes for i in draft.edges_at(node) if draft.holds(i)}
+            for item in sorted(put | cut):
+                properties = draft.row(item)[1]
+                if properties.get("kind") != "edge":
                     continue
                 for end in ("source", "target"):
-                    if p.get(end) not in nodes:
-                        reason = (
-                            f"edge {item} has {end} {p.get(end)!r}, which is no node: put the node, or delete the edge"
-                        )
-                        out.append(Problem(reason, where=item))
+                    node = properties.get(end)
+                    if not self._is_node(draft, node) and not (item in put and self._dangled(draft, item, end, node)):
+                        problem = f"edge {item} has {end} {node!r}, which is no node: put the node, or delete the edge"
+                        out.append(Problem(problem, where=item))
         return out
+
+    def _is_node(self, draft: _Draft, item: Any) -> bool:
+        """Whether a node of this id is in the network, or in that of another level."""
+        if not isinstance(item, str):
+            return False
+        if draft.holds(item):
+            return draft.row(item)[1].get("kind") == "node"
+        networks = [key for key in sorted({*self._keys, *self._drafts}) if key.layer == "topology"]
+        return any(
+            self._draft(key).holds(item) and self._draft(key).row(item)[1].get("kind") == "node" for key in networks
+        )
+
+    @staticmethod
+    def _dangled(draft: _Draft, item: str, end: str, node: Any) -> bool:
+        """Whether the stored edge ended there already, in nothing, and not by these edits."""
+        return item in draft.place and draft.before(item)[1].get(end) == node and node not in draft.deletes
 
     def loosen(self) -> None:
         """Cut the tie of network items to a drawn line where either of them was edited.

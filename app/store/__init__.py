@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from app.store import schema
+from sqlalchemy import select
+
+from app.store import schema, tables
 from app.store.blobs import Blobs
 from app.store.channels import Channels
 from app.store.chunks import Chunks
@@ -65,6 +67,11 @@ class Store(
     def recover(self) -> None:
         """At start: remove what a killed upload left behind. Safe beside other processes that are at work."""
         self.blobs.recover(ABANDONED_SECONDS)
+
+    def epoch(self) -> int:
+        """The server's epoch: it rises when the database is restored from a backup. Robots order by it first."""
+        with self._database.read() as connection:
+            return int(connection.execute(select(tables.server.c.epoch)).scalar_one_or_none() or 0)
 
     def close(self) -> None:
         """Give back connections."""

@@ -10,9 +10,11 @@ from typing import Any, Final, Literal
 from sqlalchemy import Connection, Row, insert, select, update
 
 from app.errors import Invalid, NotFound
+from app.model.closures import ClosureMode, Closures
 from app.store import outbox, tables
 from app.store.base import CHANNEL_NAME, Base, environment_row, text, utcnow
 from app.store.manifest import read_version
+from app.store.overlays import closures_in_force
 from app.store.robots import robots_of
 from app.store.values import (
     LATEST,
@@ -58,11 +60,20 @@ class Channels(Base):
                 .where(table.c.environment_id == row.id)
                 .order_by(table.c.name)
             )
-            others = [_as_channel(r, r.root, r.planned_root) for r in connection.execute(query)]
-        return [Channel(LATEST, row.head, row.root, head.sequence, None, head.author, head.time), *others]
+            closures = closures_in_force(connection, row)
+            rows = connection.execute(query).all()
+        others = [_as_channel(r, r.root, r.planned_root, row, closures) for r in rows]
+        latest = Channel(LATEST, row.head, row.root, head.sequence, None, head.author, head.time)
+        return [replace(latest, closures=closures, closures_sequence=row.closures_sequence), *others]
 
-    def standing(self, environment: str, ref: str | int) -> tuple[Version, int]:
-        """A version by number or channel, and the sequence of the event that brought it (the channel) there."""
+    def standing(self, environment: str, ref: str | int, closures: ClosureMode | None = None) -> tuple[Version, int]:
+        """Read a version by number or channel as maps of it are made, and the sequence of what it shows.
+
+        closures: how its maps show the closures in force; default: applied for a channel, ignored for a number, which
+        is history. The sequence is that of the event that brought the channel (or the version) there or, if that is
+        later, that changed which closures are in force.
+        """
+        mode = closures or ("ignore" if isinstance(ref, int) else "apply")
         table, version = tables.channel, tables.version
         with self._database.snapshot() as connection:
             row = environment_row(connection, environment)
@@ -79,7 +90,11 @@ class Channels(Base):
                 if known is None or known.version is None:
                     raise NotFound(f"{environment} has no channel {ref!r} that stands on a version")
                 number, sequence = known.version, known.sequence
-            return read_version(connection, row, number), int(sequence or 0)
+            found, sequence = read_version(connection, row, number), int(sequence or 0)
+            if mode == "ignore":
+                return found, sequence
+            in_force = closures_in_force(connection, row).shown(mode)
+            return replace(found, closures=in_force), max(sequence, int(row.closures_sequence))
 
     def set_channel(
         self,
@@ -254,15 +269,18 @@ def _read(connection: Connection, environment: Row[Any], channel: str) -> Channe
     planned = None
     if row.planned_version is not None:
         planned = read_version(connection, environment, row.planned_version).root
-    return _as_channel(row, root, planned)
+    return _as_channel(row, root, planned, environment, closures_in_force(connection, environment))
 
 
-def _as_channel(row: Row[Any], root: str | None, planned_root: str | None) -> Channel:
+def _as_channel(
+    row: Row[Any], root: str | None, planned_root: str | None, environment: Row[Any], closures: Closures
+) -> Channel:
     planned = None
     if row.planned_version is not None:
         planned = Planned(row.planned_version, row.planned_at, row.planned_author or "", planned_root or "")
     rollout = None if row.rollout is None else Rollout.from_row(row.rollout)
-    return Channel(row.name, row.version, root, row.sequence, planned, row.author, row.time, rollout)
+    more = (closures, environment.closures_sequence)
+    return Channel(row.name, row.version, root, row.sequence, planned, row.author, row.time, rollout, *more)
 
 
 def _store(connection: Connection, environment: Row[Any], channel: str, known: object, **values: Any) -> None:

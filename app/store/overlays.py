@@ -1,7 +1,7 @@
-"""Overlays: what robots report as blocked for a time, until an editor decides on it. Each step is an event.
+"""Overlays: what is reported as blocked for a time. Accepted ones are closures, in force on every channel.
 
-An accepted overlay is told of (``overlay.accepted``) when the version that it went into is known, after that version's
-own event. Who follows overlays goes by events, not by ``expires``: reported again, the end moves without an event.
+Each step is an event, written in its transaction. Events that change what is in force are also what a channel's
+manifest is ordered by.
 """
 
 from __future__ import annotations
@@ -9,83 +9,88 @@ from __future__ import annotations
 import secrets
 from collections.abc import Mapping
 from contextlib import suppress
-from datetime import datetime, timedelta
+from datetime import datetime
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, func, insert, or_, select, update
+from sqlalchemy import Connection, Row, func, insert, select, update
 
 from app.errors import Conflict, NotFound
 from app.event_types import EventType
+from app.model.closures import Closures
 from app.store import outbox, tables
-from app.store.base import Base, environment_row, text, utcnow
-from app.store.values import Overlay, OverlayState
+from app.store.base import Base, environment_row, text
+from app.store.values import Overlay, OverlayState, rfc3339
 
 MAX_PENDING: Final = 1000
-"""So many overlays of an environment may wait for a decision."""
+"""Maximum number of an environment's overlays that wait for a decision."""
 
 MAX_OF_ONE: Final = 100
-"""So many of them may one reporter have: one that goes wild leaves room for the others."""
+"""Maximum number of them from one reporter: one that goes wild leaves room for the others."""
+
+MAX_IN_FORCE: Final = 1000
+"""Maximum number of closures of an environment: every manifest lists them."""
 
 MAX_LISTED: Final = 10_000
-TOLD: Final[Mapping[OverlayState, EventType]] = {"rejected": "overlay.rejected", "ended": "overlay.ended"}
-"""What deciding tells. An acceptance is told once its version is known."""
+EVENTS: Final[Mapping[OverlayState, EventType]] = {
+    "accepted": "overlay.accepted",
+    "rejected": "overlay.rejected",
+    "ended": "overlay.ended",
+    "kept": "overlay.ended",
+}
+"""The event of each decision."""
 
-LOST_AFTER: Final = timedelta(seconds=60)
-"""An acceptance that has named no version after so long was cut off: it may stand in one all the same."""
+CHANGE_CLOSURES: Final = frozenset({"overlay.accepted", "overlay.ended"})
+"""Events after which other closures are in force."""
 
-AT_ONCE: Final = 100
-"""Overlays that are ended in one go."""
+MAX_AT_ONCE: Final = 100
+"""Maximum number of overlays that are ended in one call."""
 
 
 class Overlays(Base):
     """Pending and decided overlays."""
 
-    def add_overlay(self, wanted: Overlay) -> tuple[Overlay, bool]:
-        """Keep a pending overlay: (it, whether it is new). id and state are set here.
+    def add_overlay(self, overlay: Overlay) -> tuple[Overlay, bool]:
+        """Store a pending or accepted overlay: (the stored one, whether it is new). The id is set here.
 
-        The same reported again by the same reporter while it is pending only moves its end. NotFound for an unknown
-        environment, Conflict where too many wait.
+        The same report again by the same reporter, while it is pending, only moves its end. Raises NotFound for an
+        unknown environment, Conflict if too many wait or are in force.
         """
         table = tables.overlay
+        accepted = overlay.state == "accepted"
         with self._database.write() as connection:
-            row = environment_row(connection, wanted.environment, lock=True)
-            pending = (table.c.environment_id == row.id, table.c.state == "pending")
-            own = select(table).where(*pending, table.c.reporter == wanted.reporter, table.c.expires > wanted.created)
-            theirs = connection.execute(own).all()
-            for known in theirs:
-                same = (known.kind, known.level, known.polygon, known.edge, known.crs)
-                if same == (wanted.kind, wanted.level, wanted.polygon, wanted.edge, wanted.crs):
-                    values = {"expires": wanted.expires, "detail": wanted.detail}
-                    connection.execute(update(table).where(table.c.id == known.id).values(values))
-                    return _read(connection, row, known.id), False
-            if len(theirs) >= MAX_OF_ONE:
-                raise Conflict(f"{MAX_OF_ONE} overlays of {wanted.reporter} wait for a decision: no more are taken")
-            waiting = select(func.count()).select_from(table).where(*pending)
-            if connection.execute(waiting).scalar_one() >= MAX_PENDING:
-                raise Conflict(f"{MAX_PENDING} overlays of {wanted.environment} wait: accept or reject some")
-            new = secrets.token_hex(8)
+            row = environment_row(connection, overlay.environment, lock=True)
+            if accepted:
+                _require_room(connection, row)
+            elif (same := _pending_twin(connection, row, overlay)) is not None:
+                values = {"expires": overlay.expires, "detail": overlay.detail}
+                connection.execute(update(table).where(table.c.id == same).values(values))
+                return _read(connection, row, same), False
+            overlay_id = secrets.token_hex(8)
             connection.execute(
                 insert(table).values(
-                    id=new,
+                    id=overlay_id,
                     environment_id=row.id,
-                    kind=wanted.kind,
-                    state="pending",
-                    level=wanted.level,
-                    polygon=wanted.polygon,
-                    edge=wanted.edge,
-                    crs=wanted.crs,
-                    detail=None if wanted.detail is None else text(wanted.detail, "a detail"),
-                    reporter=text(wanted.reporter, "a reporter"),
-                    created=wanted.created,
-                    expires=wanted.expires,
+                    kind=overlay.kind,
+                    state=overlay.state,
+                    level=overlay.level,
+                    polygon=overlay.polygon,
+                    edge=overlay.edge,
+                    crs=overlay.crs,
+                    detail=None if overlay.detail is None else text(overlay.detail, "a detail"),
+                    reporter=text(overlay.reporter, "a reporter"),
+                    created=overlay.created,
+                    expires=overlay.expires,
+                    decided_by=overlay.decided_by,
+                    decided=overlay.decided,
                 )
             )
-            made = _read(connection, row, new)
-            _tell(connection, row, made, "overlay.created", made.reporter, made.created)
-            return made, True
+            stored = _read(connection, row, overlay_id)
+            event: EventType = "overlay.accepted" if accepted else "overlay.created"
+            _append_event(connection, row, stored, event, stored.reporter, stored.created)
+            return stored, True
 
     def overlays(self, environment: str, state: OverlayState | None = None) -> list[Overlay]:
-        """An environment's overlays, oldest first, of very many the newest; NotFound."""
+        """List an environment's overlays, oldest first (if there are very many, the newest). Raises NotFound."""
         table = tables.overlay
         newest = (table.c.created.desc(), table.c.id.desc())
         with self._database.read() as connection:
@@ -97,83 +102,144 @@ class Overlays(Base):
         return [_as_overlay(environment, r) for r in reversed(rows)]
 
     def overlay(self, environment: str, id: str) -> Overlay:
-        """One overlay; NotFound."""
+        """Read one overlay. Raises NotFound."""
         with self._database.read() as connection:
             return _read(connection, environment_row(connection, environment), id)
 
+    def closures(self, environment: str) -> Closures:
+        """Read the closures in force. Raises NotFound for an unknown environment."""
+        with self._database.read() as connection:
+            return closures_in_force(connection, environment_row(connection, environment))
+
     def decide_overlay(
-        self, environment: str, id: str, before: OverlayState, state: OverlayState, author: str, now: datetime
+        self,
+        environment: str,
+        id: str,
+        before: OverlayState,
+        state: OverlayState,
+        author: str,
+        now: datetime,
+        *,
+        version: int | None = None,
     ) -> Overlay:
-        """Change its state; Conflict where it is not (or no longer) in the state ``before``."""
+        """Change an overlay's state, with the event of it. Raises Conflict if it is not in the state ``before``.
+
+        version: the one that made it permanent.
+        """
         table = tables.overlay
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
-            known = _read(connection, row, id)
-            if known.state != before:
-                raise Conflict(f"the overlay {id} is {known.state}, not {before}")
+            stored = _read(connection, row, id)
+            if stored.state != before:
+                raise Conflict(f"the overlay {id} is {stored.state}, not {before}")
+            if state == "accepted":
+                _require_room(connection, row)
             values: dict[str, Any] = {"state": state, "decided_by": text(author, "an author"), "decided": now}
-            if state == "pending":
-                values |= {"decided_by": None, "decided": None}
+            if version is not None:
+                values["version"] = version
             connection.execute(update(table).where(table.c.id == id).values(values))
             decided = _read(connection, row, id)
-            if (kind := TOLD.get(state)) is not None:
-                _tell(connection, row, decided, kind, author, now)
+            if (event := EVENTS.get(state)) is not None:
+                _append_event(connection, row, decided, event, author, now)
             return decided
 
-    def note_overlay_version(self, environment: str, id: str, version: int) -> Overlay:
-        """The version that an accepted overlay went into: now it is told of.
+    def end_due_overlays(self, now: datetime) -> list[Overlay]:
+        """End what is due: pending overlays expire, closures are lifted, each with its event.
 
-        It counts as accepted whatever was decided meanwhile: it is in the map, and has to be taken out again.
-        """
-        table = tables.overlay
-        with self._database.write() as connection:
-            row = environment_row(connection, environment, lock=True)
-            before = _read(connection, row, id)
-            values: dict[str, Any] = {"version": version}
-            if before.state != "ended":
-                values["state"] = "accepted"
-            connection.execute(update(table).where(table.c.id == id).values(values))
-            noted = _read(connection, row, id)
-            if before.version is None and noted.state == "accepted":
-                _tell(connection, row, noted, "overlay.accepted", noted.decided_by or "", utcnow())
-            return noted
-
-    def expire_overlays(self, now: datetime) -> list[Overlay]:
-        """Pending overlays whose time is over expire. Accepted ones whose time is over: to be taken out by the caller,
-        who then ends them with ``decide_overlay``.
+        Returns the due overlays that a release before closures put into a version: the caller takes them out of it and
+        ends them with ``decide_overlay``.
         """
         table, owner = tables.overlay, tables.environment
-        joined = select(table, owner.c.name.label("environment")).join(owner, owner.c.id == table.c.environment_id)
-        over = joined.where(table.c.expires <= now, owner.c.deleted.is_(None)).order_by(table.c.expires, table.c.id)
-        over = over.limit(AT_ONCE)
+        query = (
+            select(table, owner.c.name.label("environment"))
+            .join(owner, owner.c.id == table.c.environment_id)
+            .where(table.c.expires <= now, table.c.state.in_(("pending", "accepted")), owner.c.deleted.is_(None))
+            .order_by(table.c.expires, table.c.id)
+            .limit(MAX_AT_ONCE)
+        )
         with self._database.read() as connection:
-            pending = connection.execute(over.where(table.c.state == "pending")).all()
-            whole = or_(table.c.version.is_not(None), table.c.decided < now - LOST_AFTER)
-            accepted = connection.execute(over.where(table.c.state == "accepted", whole)).all()
-        for found in pending:
+            due = connection.execute(query).all()
+        in_version = [r for r in due if r.state == "accepted" and r.version is not None]
+        for found in due:
+            if found in in_version:
+                continue
             with suppress(NotFound), self._database.write() as connection:
                 row = environment_row(connection, found.environment, lock=True)
-                known = _read(connection, row, found.id)
-                if known.state == "pending" and known.expires <= now:  # else somebody was quicker
-                    connection.execute(update(table).where(table.c.id == found.id).values(state="expired", decided=now))
-                    _tell(connection, row, _read(connection, row, found.id), "overlay.expired", "", now)
-        return [_as_overlay(r.environment, r) for r in accepted]
+                stored = _read(connection, row, found.id)
+                if stored.state != found.state or stored.expires > now:
+                    continue  # another process was faster, or the end has moved
+                state: OverlayState = "expired" if stored.state == "pending" else "ended"
+                event: EventType = "overlay.expired" if stored.state == "pending" else "overlay.ended"
+                connection.execute(update(table).where(table.c.id == found.id).values(state=state, decided=now))
+                author = stored.decided_by or ""
+                _append_event(connection, row, _read(connection, row, found.id), event, author, now)
+        return [_as_overlay(r.environment, r) for r in in_version]
 
 
-def _tell(
-    connection: Connection, environment: Row[Any], overlay: Overlay, kind: EventType, author: str, now: datetime
+def closures_in_force(connection: Connection, environment: Row[Any]) -> Closures:
+    """Read the closures in force of an environment, in the caller's transaction."""
+    table = tables.overlay
+    query = select(table).where(
+        table.c.environment_id == environment.id, (table.c.state == "accepted") | table.c.version.is_not(None)
+    )
+    overlays = [_as_overlay(environment.name, r) for r in connection.execute(query.order_by(table.c.id))]
+    marked = [o for o in overlays if o.version is not None and o.state != "kept"]
+    return Closures(
+        tuple(o.closure for o in overlays if o.state == "accepted"),
+        lifted_edges=frozenset((o.edge, rfc3339(o.expires)) for o in marked if o.edge is not None),
+        lifted_zones=frozenset(zone_id(o.id) for o in marked if o.polygon is not None),
+    )
+
+
+def zone_id(overlay_id: str) -> str:
+    """Return the id of the zone that stands for an overlay's polygon."""
+    return f"overlay-{overlay_id}"
+
+
+def _require_room(connection: Connection, environment: Row[Any]) -> None:
+    table = tables.overlay
+    in_force = (table.c.environment_id == environment.id, table.c.state == "accepted")
+    if connection.execute(select(func.count()).select_from(table).where(*in_force)).scalar_one() >= MAX_IN_FORCE:
+        raise Conflict(f"{MAX_IN_FORCE} overlays of {environment.name} are in force: end or keep some first")
+
+
+def _pending_twin(connection: Connection, environment: Row[Any], overlay: Overlay) -> str | None:
+    """The id of the same reporter's same report that still waits. Raises Conflict if too many wait."""
+    table = tables.overlay
+    pending = (table.c.environment_id == environment.id, table.c.state == "pending")
+    own = select(table).where(*pending, table.c.reporter == overlay.reporter, table.c.expires > overlay.created)
+    theirs = connection.execute(own).all()
+    for row in theirs:
+        same = (row.kind, row.level, row.polygon, row.edge, row.crs)
+        if same == (overlay.kind, overlay.level, overlay.polygon, overlay.edge, overlay.crs):
+            return str(row.id)
+    if len(theirs) >= MAX_OF_ONE:
+        raise Conflict(f"{MAX_OF_ONE} overlays of {overlay.reporter} wait for a decision: no more are taken")
+    waiting = select(func.count()).select_from(table).where(*pending)
+    if connection.execute(waiting).scalar_one() >= MAX_PENDING:
+        raise Conflict(f"{MAX_PENDING} overlays of {environment.name} wait: accept or reject some")
+    return None
+
+
+def _append_event(
+    connection: Connection, environment: Row[Any], overlay: Overlay, event: EventType, author: str, now: datetime
 ) -> None:
-    """The event of one step. version and root are the head's; the environment's row is locked and as it is stored."""
+    """Append the event of one step. version and root are the head's; the caller has locked the environment's row."""
     sequence = environment.sequence + 1
     owner = tables.environment
-    connection.execute(update(owner).where(owner.c.id == environment.id).values(sequence=sequence))
+    values: dict[str, Any] = {"sequence": sequence}
+    more: dict[str, Any] = {"overlay": overlay.as_dict()}
+    if event in CHANGE_CLOSURES:
+        values["closures_sequence"] = sequence
+        more["overlays_digest"] = closures_in_force(connection, environment).digest
+    connection.execute(update(owner).where(owner.c.id == environment.id).values(values))
     what = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
     outbox.append(
         connection,
         environment_id=environment.id,
         environment=environment.name,
         sequence=sequence,
-        kind=kind,
+        kind=event,
         version=environment.head,
         root=environment.root,
         previous=None,
@@ -181,7 +247,7 @@ def _tell(
         message=f"{what}, reported as {overlay.kind}" + (f": {overlay.detail}" if overlay.detail else ""),
         author=author,
         time=now,
-        overlay=overlay.as_dict(),
+        **more,
     )
 
 

@@ -13,6 +13,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from app.errors import Conflict, FleetMapError, Invalid, NotFound
 from app.store import tables
 from app.store.base import Base, clean, environment_row
+from app.store.overlays import CHANGE_CLOSURES
 from app.store.values import LATEST, Heard, Held, Move, Report, Robot
 
 HISTORY: Final = 200
@@ -142,18 +143,25 @@ class Robots(Base):
                 )
 
     def moves(self, environment: str, channel: str) -> list[Move]:
-        """The newest events that brought a channel somewhere, oldest first; of ``latest`` each new version."""
+        """The newest events that brought a channel somewhere, oldest first; of ``latest`` each new version.
+
+        Events that changed which closures are in force are among them, with an empty root: they move no channel.
+        """
         table = tables.event
-        kind = "version.created" if channel == LATEST else "channel.moved"
+        kind = table.c.body["type"].as_string()
         with self._database.read() as connection:
             row = environment_row(connection, environment)
-            query = select(table.c.sequence, table.c.body, table.c.time).where(
-                table.c.environment_id == row.id, table.c.body["type"].as_string() == kind
-            )
+            moved = kind == "version.created"
             if channel != LATEST:
-                query = query.where(table.c.body["channel"].as_string() == channel)
+                moved = (kind == "channel.moved") & (table.c.body["channel"].as_string() == channel)
+            query = select(table.c.sequence, table.c.body, table.c.time).where(
+                table.c.environment_id == row.id, moved | kind.in_(CHANGE_CLOSURES)
+            )
             rows = connection.execute(query.order_by(table.c.sequence.desc()).limit(MAX_MOVES)).all()
-        return [Move(r.sequence, r.body["version"], r.body["root"], r.time) for r in reversed(rows)]
+        return [
+            Move(r.sequence, r.body["version"], "" if "overlay" in r.body else r.body["root"], r.time)
+            for r in reversed(rows)
+        ]
 
 
 def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMapError | None:
@@ -167,6 +175,7 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
         "state": report.state,
         "detail": None if report.detail is None else clean(report.detail),
         "sequence": report.sequence,
+        "overlays": report.overlays,
     }
     values: dict[str, Any] = {**said, "said": report.said, "time": heard.time}
     again = known is not None and all(getattr(known, name) == value for name, value in said.items())
@@ -176,8 +185,9 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
     if not again:
         values["since"] = heard.time
     if report.state == "active":
-        same = known is not None and known.held_root == report.root
+        same = known is not None and (known.held_root, known.held_overlays) == (report.root, report.overlays)
         values |= {"held_version": report.version, "held_root": report.root, "held_sequence": report.sequence}
+        values["held_overlays"] = report.overlays
         values["held_since"] = known.held_since if same and known is not None else heard.time
     if known is not None:
         connection.execute(update(table).where(*own).values(values))
@@ -240,7 +250,7 @@ def robots_of(connection: Connection, environment_id: str, channel: str) -> list
 
 
 def _as_report(row: Row[Any]) -> Report:
-    return Report(row.channel, row.version, row.root, row.state, row.detail, row.sequence, row.said)
+    return Report(row.channel, row.version, row.root, row.state, row.detail, row.sequence, row.said, row.overlays)
 
 
 def _cursor(robot: Robot) -> str:
@@ -250,5 +260,5 @@ def _cursor(robot: Robot) -> str:
 def _as_robot(row: Row[Any]) -> Robot:
     held = None
     if row.held_root is not None:
-        held = Held(row.held_version, row.held_root, row.held_sequence, row.held_since)
+        held = Held(row.held_version, row.held_root, row.held_sequence, row.held_since, row.held_overlays)
     return Robot(row.robot, row.environment, _as_report(row), row.time, row.since, held, row.there, row.seen)

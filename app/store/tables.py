@@ -158,6 +158,7 @@ environment = Table(
     Column("head", Integer, nullable=False),
     Column("root", String(64), nullable=False),
     Column("sequence", BigInteger, nullable=False),
+    Column("closures_sequence", BigInteger, nullable=False, server_default="0"),
     Column("datum", JSON(none_as_null=True), nullable=True),
     Column("indexed", Integer, nullable=False),
     Column("created", Moment, nullable=False),
@@ -166,7 +167,8 @@ environment = Table(
     *_box(),
     Column("extent", Place, nullable=True),
 )
-"""head and root: of the newest version. sequence: of the last event. indexed: the version that ``place`` shows."""
+"""head and root: of the newest version. sequence: of the last event. closures_sequence: of the last event that changed
+which closures are in force. indexed: the version that ``place`` shows."""
 
 Index("ix_environment_extent", environment.c.extent, postgresql_using="gist", info=POSTGRESQL).ddl_if(
     dialect="postgresql"
@@ -328,6 +330,7 @@ def _report() -> list[Column[Any]]:
         Column("state", String(16), nullable=False),
         Column("detail", Text, nullable=True),
         Column("sequence", BigInteger, nullable=True),
+        Column("overlays", String(64), nullable=True),
         Column("said", Moment, nullable=True),
         Column("time", Moment, nullable=False),
     ]
@@ -343,6 +346,7 @@ robot = Table(
     Column("held_version", BigInteger, nullable=True),
     Column("held_root", String(64), nullable=True),
     Column("held_sequence", BigInteger, nullable=True),
+    Column("held_overlays", String(64), nullable=True),
     Column("held_since", Moment, nullable=True),
 )
 """Robots as they are now, for each environment. since: when they first said this. held: what they drive on, which a
@@ -358,6 +362,14 @@ robot_history = Table(
     Index("ix_robot_history_robot", "environment_id", "robot", "id"),
 )
 """What robots said, each time that it was something new; the newest of each robot are kept."""
+
+server = Table(
+    "server",
+    metadata,
+    Column("id", Integer, primary_key=True, autoincrement=False),
+    Column("epoch", BigInteger, nullable=False),
+)
+"""One row. epoch: rises when the database is restored from a backup, so that robots accept lower sequences again."""
 
 overlay = Table(
     "overlay",
@@ -380,7 +392,8 @@ overlay = Table(
     Index("ix_overlay_environment", "environment_id", "state"),
     Index("ix_overlay_expires", "state", "expires"),
 )
-"""What is reported as blocked. expires: end of the blocking. version: that an accepted one went into."""
+"""What is reported as blocked. expires: end of the blocking. version: that made it permanent; of rows that releases
+before closures wrote, the version that it was put into."""
 
 presence = Table(
     "presence",

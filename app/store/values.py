@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import Problem
+from app.model.closures import NO_CLOSURES, Closure, Closures
 from app.model.features import Features
 from app.model.frame import Datum, Level
 from app.model.layers import LAYERS, Layer, PartKey
@@ -169,7 +170,7 @@ class Version:
 
     environment: its name. changes: counts of what this version changed against its parent, by layer. warnings: what
     was doubtful in its sources. parts: sorted by key. templates: what is filled in where a format asks for more than
-    the layers have.
+    the layers have. closures: those that its maps show; None: none (as it is stored).
     """
 
     environment: str
@@ -186,6 +187,7 @@ class Version:
     levels: tuple[Level, ...]
     parts: tuple[PartEntry, ...]
     templates: Templates = NO_TEMPLATES
+    closures: Closures | None = None
 
     def part(self, key: PartKey) -> PartEntry | None:
         """The entry of a part, or None."""
@@ -333,6 +335,7 @@ class Channel:
     """A movable name for a version. version and root are None where the first move is still planned.
 
     sequence: of the event that moved it last (``latest``: of the event that made the head). rollout: the last one.
+    closures: those in force, and closures_sequence: of the last event that changed them.
     """
 
     name: str
@@ -343,6 +346,8 @@ class Channel:
     author: str
     time: datetime
     rollout: Rollout | None = None
+    closures: Closures = NO_CLOSURES
+    closures_sequence: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -397,7 +402,9 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a robot says of itself. said: when, by its own clock. sequence: of the last event that it has processed."""
+    """What a robot says of itself. said: when, by its own clock. sequence: of the last event that it has processed.
+    overlays: digest of the closures in the map that the report is about; None from robots that know of none.
+    """
 
     channel: str
     version: int
@@ -406,6 +413,7 @@ class Report:
     detail: str | None = None
     sequence: int | None = None
     said: datetime | None = None
+    overlays: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -420,12 +428,19 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What a robot drives on. sequence: of the event that it acted on, where it says so. since: server's clock."""
+    """What a robot drives on. sequence: of the event that it acted on, where it says so. since: server's clock.
+    overlays: digest of the closures in it.
+    """
 
     version: int
     root: str
     sequence: int | None
     since: datetime
+    overlays: str | None = None
+
+    def shows(self, root: str | None, overlays: str) -> bool:
+        """Whether this is the map of a root and of closures, given by their digest."""
+        return self.root == root and (self.overlays or NO_CLOSURES.digest) == overlays
 
 
 @dataclass(frozen=True, slots=True)
@@ -460,15 +475,16 @@ class Move:
     time: datetime
 
 
-OverlayState = Literal["pending", "accepted", "rejected", "expired", "ended"]
+OverlayState = Literal["pending", "accepted", "rejected", "expired", "ended", "kept"]
 
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
     """Something that is blocked until ``expires``: a GeoJSON polygon in ``crs``, or an edge by its id.
 
-    state: ``pending`` until an editor accepts (into ``version``) or rejects it or its time is over (``expired``);
-    an accepted one is ``ended`` when it was taken out again.
+    state: ``pending`` until an editor accepts or rejects it or its time is over (``expired``). An accepted one is in
+    force on every channel until it has ``ended``, or was made permanent by ``version`` (``kept``). Releases before
+    closures put accepted ones into a version: those have a ``version`` in every state.
     """
 
     environment: str
@@ -502,6 +518,12 @@ class Overlay:
             "version": self.version,
         }
         return out | {name: value for name, value in more.items() if value is not None}
+
+    @property
+    def closure(self) -> Closure:
+        """What it closes while it is in force."""
+        end = rfc3339(self.expires)
+        return Closure(self.id, self.kind, self.level, end, self.edge, self.polygon, self.crs, self.detail)
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,6 +52,8 @@ def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
         "/api/v1/templates": "get", f"{e}/templates": "get put delete", f"{e}/templates/{{format}}": "get put delete",
         f"{e}/diff": "get", f"{v}/delta": "get", f"{e}/overlays": "get post",
         f"{e}/overlays/{{id}}/accept": "post", f"{e}/overlays/{{id}}/reject": "post",
+        f"{e}/overlays/{{id}}/end": "post", f"{e}/overlays/{{id}}/keep": "post",
+        f"{e}/overlays/nav2": "get", f"{e}/overlays/rmf": "get", f"{e}/overlays/vda5050": "get",
         f"{v}/vda5050/actions": "get", "/api/v1/robots/{robot}/vda5050/state": "post",
         f"{e}/channels": "get", f"{e}/channels/{{channel}}": "put",
         f"{e}/channels/{{channel}}/planned": "delete", f"{e}/transform": "get", "/api/v1/convert": "post",
@@ -105,7 +107,7 @@ def test_parameters_of_formats_are_listed(api: Api, schema: dict[str, Any]) -> N
     listed = {p["name"] for p in op["parameters"] if p["in"] == "query"}
     declared = {o["name"] for f in api.get("formats").json() if f["write"] for o in f["options"] if o["for"] == "write"}
     steps = {name for step in derive.all_derivations() for name in derive.takes(step)}
-    assert listed == declared | steps | {"derive"}
+    assert listed == declared | steps | {"derive", "closures"}
 
 
 def test_every_route_asks_for_a_role(api: Api) -> None:
@@ -177,6 +179,8 @@ def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -
         if "/overlays/{id}/" in path:
             ring = [[0, 0], [1, 0], [1, 1], [0, 0]]
             blocked = {"kind": "blocked", "crs": "local", "polygon": {"type": "Polygon", "coordinates": [ring]}}
+            if path.endswith(("/end", "/keep")):
+                blocked["state"] = "accepted"
             known[path] = api("POST", "environments/farm/overlays", None, json=blocked).json()["id"]
         if path == "/api/v1/environments/{env}/derivations":
             api.upload("farm", {"lane.geojson": LANE})

@@ -1,4 +1,4 @@
-"""What robots report as blocked, and what editors make of it."""
+"""What robots report as blocked, and what editors make of it. ``test_closures.py``: how maps show it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
+from sqlalchemy import update
 
 from app.api.overlays import end_overlays
-from app.errors import Unavailable
 from app.events.messages import Event
-from app.fleet import overlays
+from app.store import tables
+from app.store.values import rfc3339
 from tests.api.conftest import Api
 
 SQUARE = {"type": "Polygon", "coordinates": [[[1, 1], [4, 1], [4, 3], [1, 3], [1, 1]]]}
@@ -48,110 +49,138 @@ def until(condition: Any) -> Any:
     return found
 
 
-def test_a_blocked_polygon_becomes_a_keepout_and_goes_again(api: Api, farm: str) -> None:
+def test_accepted_overlay_is_in_force_until_its_end_and_changes_no_version(api: Api, farm: str) -> None:
     url = f"environments/{farm}/overlays"
     robot = api.token_for("robot", robot="mower-7", environments=farm)
-    said = {"kind": "blocked", "polygon": SQUARE, "crs": "local", "ttl_seconds": 4, "detail": "a trailer"}
-    told = robot.post(url, said).json()
-    assert {k: told[k] for k in ("state", "reporter", "detail", "polygon", "crs", "level")} == {
+    report = {"kind": "blocked", "polygon": SQUARE, "crs": "local", "ttl_seconds": 4, "detail": "a trailer"}
+    pending = robot.post(url, report).json()
+    assert {k: pending[k] for k in ("state", "reporter", "detail", "polygon", "crs", "level")} == {
         "state": "pending", "reporter": "mower-7", "detail": "a trailer", "polygon": SQUARE, "crs": "local",
         "level": "ground",
     }  # fmt: skip
-    assert robot.post(url, said, 200).json()["id"] == told["id"]
-    assert api.get(f"environments/{farm}").json()["version"] == 3, "no map changes by a report"
-    robot.problem("POST", f"{url}/{told['id']}/accept", 403)
-    robot.problem("POST", f"{url}/{told['id']}/reject", 403)
-    accepted = api.post(f"{url}/{told['id']}/accept", expect=200).json()
-    assert (accepted["state"], accepted["version"], accepted["decided_by"]) == ("accepted", 4, "administrator")
-    (zone,) = zones(api, farm)
-    assert zone["properties"] == {
-        "kind": "keepout", "expires": accepted["expires"],
-        "overlay": {"id": told["id"], "reporter": "mower-7", "detail": "a trailer"},
-    }  # fmt: skip
-    assert "reported by mower-7" in api.get(f"environments/{farm}/versions/4").json()["message"]
-    mask = api.get(f"environments/{farm}/versions/4/maps/occupancy_grid/keepout.pgm").content
-    assert mask.startswith(b"P5")
-    api.problem("POST", f"{url}/{told['id']}/accept", 409)
+    assert robot.post(url, report, 200).json()["id"] == pending["id"]
+    robot.problem("POST", f"{url}/{pending['id']}/accept", 403)
+    robot.problem("POST", f"{url}/{pending['id']}/reject", 403)
+    accepted = api.post(f"{url}/{pending['id']}/accept", expect=200).json()
+    assert (accepted["state"], accepted["decided_by"]) == ("accepted", "administrator")
+    assert "version" not in accepted
+    api.problem("POST", f"{url}/{pending['id']}/accept", 409)
+    assert [o["id"] for o in api.get(f"{url}?state=accepted").json()] == [pending["id"]]
     until(lambda: api.get(f"{url}?state=ended").json())
     assert zones(api, farm) == []
-    assert api.get(f"environments/{farm}").json()["version"] == 5
+    assert api.get(f"environments/{farm}").json()["version"] == 3
     assert api.get(f"{url}?state=pending").json() == []
     events = told_of(api, farm)
     assert [(e["type"], e["version"]) for e in events] == [
-        ("overlay.created", 3), ("version.created", 4), ("overlay.accepted", 4), ("version.created", 5),
-        ("overlay.ended", 5),
+        ("overlay.created", 3), ("overlay.accepted", 3), ("overlay.ended", 3)
     ]  # fmt: skip
-    assert events[0]["overlay"] == told
+    assert events[0]["overlay"] == pending
+    assert "overlays_digest" not in events[0]
     assert (events[0]["author"], events[0]["layers"], events[0]["previous"]) == ("mower-7", [], None)
-    assert events[2]["overlay"] == accepted
-    assert events[2]["root"] == events[1]["root"] == api.get(f"environments/{farm}/versions/4").json()["root"]
-    assert events[4]["overlay"]["state"] == "ended"
+    assert events[1]["overlay"] == accepted
+    assert events[2]["overlay"]["state"] == "ended"
+    assert events[1]["overlays_digest"] != events[2]["overlays_digest"]
 
 
-def test_a_blocked_edge(api: Api, farm: str) -> None:
+def test_editor_creates_an_overlay_in_force(api: Api, farm: str) -> None:
     url = f"environments/{farm}/overlays"
-    before = edge(api, farm, "gate_barn")
-    told = api.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": 3}).json()
-    accepted = api.post(f"{url}/{told['id']}/accept", expect=200).json()
-    now = edge(api, farm, "gate_barn")
-    assert now["properties"] == {**before["properties"], "blocked": True, "blocked_until": accepted["expires"]}
-    assert now["place"] == before["place"]
-    until(lambda: api.get(f"{url}?state=ended").json())
-    assert edge(api, farm, "gate_barn") == before
-    roots = [api.get(f"environments/{farm}/versions/{v}").json()["root"] for v in (3, 5)]
-    assert roots[0] == roots[1], "nothing of it stays"
+    body = {"kind": "blocked", "edge": "gate_barn", "state": "accepted"}
+    robot = api.token_for("robot", robot="mower-7")
+    assert "only editors" in robot.problem("POST", url, 403, json=body)["detail"]
+    made = api.token_for("editor").post(url, body).json()
+    assert (made["state"], made["decided_by"], made["reporter"]) == ("accepted", "a editor", "a editor")
+    assert [e["type"] for e in told_of(api, farm)] == ["overlay.accepted"]
+    api.post(f"{url}/{made['id']}/end", expect=200)
+    assert [e["type"] for e in told_of(api, farm)] == ["overlay.accepted", "overlay.ended"]
+    api.problem("POST", f"{url}/{made['id']}/end", 409)
+    robot.problem("POST", f"{url}/{made['id']}/end", 403)
 
 
-@pytest.mark.parametrize("first", [2, 3600])
-def test_an_edge_that_two_report_is_blocked_until_the_later_end(api: Api, farm: str, first: int) -> None:
+def test_end_is_given_as_a_time_or_as_seconds(api: Api, farm: str) -> None:
     url = f"environments/{farm}/overlays"
-    before = edge(api, farm, "gate_barn")
-    said = {}
-    for seconds in (first, 3602 - first):
-        robot = api.token_for("robot", robot=f"for-{seconds}")
-        said[seconds] = robot.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": seconds}).json()
-        api.post(f"{url}/{said[seconds]['id']}/accept", expect=200)
-    until(lambda: [o["id"] for o in api.get(f"{url}?state=ended").json()] == [said[2]["id"]])
-    assert edge(api, farm, "gate_barn")["properties"]["blocked_until"] == said[3600]["expires"]
-    end_overlays(api.app.state.services, datetime.now(UTC) + timedelta(hours=2))
-    assert edge(api, farm, "gate_barn") == before
+    soon = datetime.now(UTC) + timedelta(hours=2)
+    made = api.post(url, {"kind": "blocked", "edge": "gate_barn", "expires": rfc3339(soon)}).json()
+    assert made["expires"] == rfc3339(soon)
+    for expires, more, text in (
+        (rfc3339(datetime.now(UTC) - timedelta(seconds=1)), {}, "in the past"),
+        (rfc3339(soon + timedelta(days=400)), {}, "days ahead"),
+        (soon.replace(tzinfo=None).isoformat(), {}, "time zone"),
+        (rfc3339(soon), {"ttl_seconds": 5}, "one of them"),
+    ):
+        body = {"kind": "blocked", "edge": "gate_barn", "expires": expires, **more}
+        assert text in api.problem("POST", url, 422, json=body)["detail"]
 
 
-def test_what_an_editor_blocked_stays_blocked(api: Api, farm: str) -> None:
-    """An overlay's end does not free an edge that is blocked without an end."""
+def test_edge_that_only_a_channel_has_can_be_closed(api: Api, farm: str) -> None:
+    """The robot drives on production, and the newest version has another network."""
     url = f"environments/{farm}/overlays"
-    feature = edge(api, farm, "gate_barn")
-    feature["properties"]["blocked"] = True
-    feature["properties"].pop("level", None)
-    put = {"op": "put", "layer": "topology", "level": "ground", "feature": feature}
+    api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 3}).raise_for_status()
+    gone = {"op": "delete", "layer": "topology", "id": "gate_barn"}
+    api.post(f"environments/{farm}/edits", {"changes": [gone]})
+    made = api.post(url, {"kind": "blocked", "edge": "gate_barn"}).json()
+    api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 4}).raise_for_status()
+    problem = api.problem("POST", f"{url}/{made['id']}/accept", 422)
+    assert "no edge 'gate_barn' in version 4" in problem["detail"]
+    api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 3}).raise_for_status()
+    api.post(f"{url}/{made['id']}/accept", expect=200)
+    assert "gate_barn" not in api.get(f"/maps/{farm}/tmap2").text
+    problem = api.problem("POST", f"{url}/{made['id']}/keep", 422)
+    assert "version 4" in problem["detail"]
+
+
+@pytest.mark.parametrize("what", [{"edge": "gate_barn"}, {"polygon": SQUARE, "crs": "local"}])
+def test_kept_overlay_is_a_version_and_ends(api: Api, farm: str, what: dict[str, Any]) -> None:
+    url = f"environments/{farm}/overlays"
+    made = api.post(url, {"kind": "blocked", "detail": "a wall", **what}).json()
+    api.problem("POST", f"{url}/{made['id']}/keep", 409)
+    api.post(f"{url}/{made['id']}/accept", expect=200)
+    kept = api.post(f"{url}/{made['id']}/keep", expect=200).json()
+    assert (kept["state"], kept["version"]) == ("kept", 4)
+    assert api.get(f"{url}?state=accepted").json() == []
+    if "edge" in what:
+        assert edge(api, farm, "gate_barn")["properties"]["blocked"] is True
+        assert "gate_barn" not in api.get(f"environments/{farm}/versions/4/maps/tmap2").text
+    else:
+        (zone,) = zones(api, farm)
+        assert zone["properties"] == {
+            "kind": "keepout", "overlay": {"id": made["id"], "reporter": "administrator", "detail": "a wall"},
+        }  # fmt: skip
+    assert [e["type"] for e in told_of(api, farm)][-2:] == ["version.created", "overlay.ended"]
+
+
+@pytest.mark.parametrize("what", [{"edge": "gate_barn"}, {"polygon": SQUARE, "crs": "local"}])
+def test_overlay_of_an_earlier_release_goes_on_as_a_closure(api: Api, farm: str, what: dict[str, Any]) -> None:
+    """It stands in version 4, which was promoted: it ends there as well, and goes from the newest version."""
+    url = f"environments/{farm}/overlays"
+    end = rfc3339(datetime.now(UTC) + timedelta(hours=1))
+    made = api.post(url, {"kind": "blocked", "expires": end, "state": "accepted", **what}).json()
+    if "edge" in what:
+        layer, feature = "topology", edge(api, farm, "gate_barn")
+        feature["properties"] |= {"blocked": True, "blocked_until": end}
+        feature["properties"].pop("level", None)
+    else:
+        layer, properties = "zones", {"kind": "keepout", "expires": end, "overlay": {"id": made["id"]}}
+        feature = {"type": "Feature", "id": f"overlay-{made['id']}", "properties": properties, "geometry": SQUARE}
+    put = {"op": "put", "layer": layer, "level": "ground", "crs": "local", "feature": feature}
     api.post(f"environments/{farm}/edits", {"changes": [put]})
-    told = api.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": 1}).json()
-    assert api.post(f"{url}/{told['id']}/accept", expect=200).json()["version"] == 4
-    until(lambda: api.get(f"{url}?state=ended").json())
-    assert edge(api, farm, "gate_barn")["properties"]["blocked"] is True
-    assert api.get(f"environments/{farm}").json()["version"] == 4
+    api.http.put(f"/api/v1/environments/{farm}/channels/production", json={"version": 4}).raise_for_status()
+    store = api.app.state.services.store
+    with store._database.write() as connection:
+        connection.execute(update(tables.overlay).where(tables.overlay.c.id == made["id"]).values(version=4))
 
+    def blocked() -> bool:
+        if "edge" in what:
+            return "gate_barn" not in api.get(f"/maps/{farm}/tmap2").text
+        return made["id"] in api.get(f"/maps/{farm}/geojson").text
 
-def test_what_others_write_meanwhile_is_not_put_back(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between an acceptance's look at the edge and its version an editor changes the same edge."""
-    url = f"environments/{farm}/overlays"
-    told = api.post(url, {"kind": "blocked", "edge": "gate_barn"}).json()
-    feature = edge(api, farm, "gate_barn")
-    feature["properties"] |= {"surface": "gravel"}
-    feature["properties"].pop("level", None)
-    put = {"op": "put", "layer": "topology", "level": "ground", "feature": feature}
-    look, meanwhile = overlays.edge_of, iter([put])
-
-    def slow(*args: Any) -> Any:
-        found = look(*args)
-        for change in meanwhile:
-            api.as_(api.token).post(f"environments/{farm}/edits", {"changes": [change]})
-        return found
-
-    monkeypatch.setattr(overlays, "edge_of", slow)
-    assert api.post(f"{url}/{told['id']}/accept", expect=200).json()["version"] == 5
-    now = edge(api, farm, "gate_barn")["properties"]
-    assert (now["surface"], now["blocked"]) == ("gravel", True)
+    assert blocked()
+    assert api.get(f"/maps/{farm}/geojson").text.count(f'"overlay-{made["id"]}"') <= 1
+    end_overlays(api.app.state.services, datetime.now(UTC) + timedelta(hours=2))
+    assert api.get(f"{url}?state=ended").json()[0]["id"] == made["id"]
+    assert not blocked(), "production still stands on version 4"
+    assert api.get(f"environments/{farm}").json()["version"] == 5
+    roots = [api.get(f"environments/{farm}/versions/{v}").json()["root"] for v in (3, 5)]
+    assert roots[0] == roots[1] or "polygon" in what, "nothing of it stays"
 
 
 def test_a_polygon_is_kept_without_what_came_along(api: Api, farm: str, bare: str) -> None:
@@ -200,38 +229,6 @@ def test_undecided_overlays_expire(api: Api, farm: str) -> None:
     assert Event.from_json(json.dumps(told_of(api, farm)[1])).type == "overlay.expired"
 
 
-def test_an_acceptance_that_was_cut_off_ends_as_well(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """kill -9 after the version and before it was noted: the edge does not stay blocked."""
-    url = f"environments/{farm}/overlays"
-    before = edge(api, farm, "gate_barn")
-    told = api.post(url, {"kind": "blocked", "edge": "gate_barn", "ttl_seconds": 2}).json()
-    store = api.app.state.services.store
-
-    def cut_off(*_: Any) -> Any:
-        raise Unavailable("gone")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(type(store), "note_overlay_version", cut_off)
-        api.problem("POST", f"{url}/{told['id']}/accept", 503)
-    assert edge(api, farm, "gate_barn")["properties"]["blocked"] is True
-    later = datetime.now(UTC) + timedelta(seconds=50)
-    assert told["id"] not in {o.id for o in store.expire_overlays(later)}, "somebody may be at it"
-    end_overlays(api.app.state.services, datetime.now(UTC) + timedelta(seconds=70))
-    assert edge(api, farm, "gate_barn") == before
-    assert [o["state"] for o in api.get(url).json()] == ["ended"]
-
-
-def test_a_zone_that_an_editor_removed_is_not_missed(api: Api, farm: str) -> None:
-    url = f"environments/{farm}/overlays"
-    said = {"kind": "blocked", "polygon": SQUARE, "crs": "local", "ttl_seconds": 2}
-    told = api.post(url, said).json()
-    api.post(f"{url}/{told['id']}/accept", expect=200)
-    gone = {"op": "delete", "layer": "zones", "id": f"overlay-{told['id']}"}
-    api.post(f"environments/{farm}/edits", {"changes": [gone]})
-    until(lambda: api.get(f"{url}?state=ended").json())
-    assert api.get(f"environments/{farm}").json()["version"] == 5
-
-
 def test_refusals(api: Api, farm: str, bare: str) -> None:
     url = f"environments/{farm}/overlays"
     line = {"type": "LineString", "coordinates": [[0, 0], [1, 1]]}
@@ -249,20 +246,3 @@ def test_refusals(api: Api, farm: str, bare: str) -> None:
     api.problem("GET", f"{url}?state=odd", 422)
     api.problem("GET", "environments/nowhere/overlays", 404)
     assert api.get(url).json() == []
-
-
-def test_what_cannot_be_accepted_waits_on(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    url = f"environments/{farm}/overlays"
-    told = api.post(url, {"kind": "blocked", "edge": "gate_barn"}).json()
-    here = api.app.state.services
-
-    def busy(*_: Any, **__: Any) -> Any:
-        raise Unavailable("busy")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(type(here.ingest), "amend", busy)
-        api.problem("POST", f"{url}/{told['id']}/accept", 503)
-    (now,) = api.get(url).json()
-    assert now["state"] == "pending"
-    assert "decided" not in now
-    assert api.post(f"{url}/{told['id']}/accept", expect=200).json()["version"] == 4

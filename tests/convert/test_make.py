@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import pytest
 import shapely
 
 from app import formats
 from app.convert import make
+from app.formats import ReadContext
+from app.model.closures import ClosureMode, Closures
 from app.model.features import features
 from app.model.frame import Datum
 from app.model.layers import NETWORK, Layers, PartKey
@@ -24,28 +28,45 @@ def network(**said: object) -> Layers:
     return Layers({PartKey("topology", "ground", NETWORK): features(rows, "local")}, Datum(53.2, -0.5))
 
 
-def warned(name: str, layers: Layers) -> list[str]:
-    report = make.from_layers(formats.get_format(name), layers, {}, derived=False).report
-    return [w["problem"] for w in report["warnings"] if "blocked" in w["problem"]]
+def made(name: str, layers: Layers, mode: ClosureMode = "apply") -> make.Written:
+    closures = Closures(mode=mode)
+    return make.from_layers(formats.get_format(name), layers, {}, derived=False, closures=closures)
+
+
+def edges_in(name: str, files: Mapping[str, bytes]) -> set[tuple[str, str]]:
+    """The edges of a map, as our own reader finds them; a node is a or b by its place, west or east."""
+    (group,), _ = formats.group(files, name)
+    out = set()
+    for part in formats.read(group, ReadContext()).vector("topology").values():
+        place = {i: shapely.get_coordinates(g)[0, 0] for i, g in zip(part.ids, part.geometry, strict=True)}
+        for p in part.properties:
+            if p.get("kind") == "edge":
+                start, end = place[str(p["source"])], place[str(p["target"])]
+                out.add(("a", "b") if start < end else ("b", "a"))
+    return out
 
 
 @pytest.mark.parametrize("name", PLANNED)
-def test_a_blocked_edge_is_told_of_where_planners_do_not_read_of_it(name: str) -> None:
-    (told,) = warned(name, network(blocked=True, blocked_until="2030-01-01T00:00:00Z"))
-    assert told.startswith("1 edges are blocked")
-    assert name in told
-    assert warned(name, network()) == []
-    assert warned(name, network(blocked=False)) == []
+def test_blocked_edge_is_left_out_and_reported(name: str) -> None:
+    written = made(name, network(blocked=True))
+    assert edges_in(name, written.files) == {("b", "a")}
+    assert [d["count"] for d in written.report["dropped"] if d["what"] == "blocked edges"] == [1]
+    for free in (network(), network(blocked=False)):
+        written = made(name, free)
+        assert edges_in(name, written.files) == {("a", "b"), ("b", "a")}
+        assert not [d for d in written.report["dropped"] if d["what"] == "blocked edges"]
 
 
-def test_a_package_tells_it_once_for_each_map_in_it() -> None:
-    told = warned("environment", network(blocked=True))
-    assert told
-    assert len(told) == len(set(told))
+@pytest.mark.parametrize("name", PLANNED)
+def test_blocked_edge_stays_with_a_warning_when_marked(name: str) -> None:
+    written = made(name, network(blocked=True), "mark")
+    assert edges_in(name, written.files) == {("a", "b"), ("b", "a")}
+    (warning,) = [w["problem"] for w in written.report["warnings"] if "blocked" in w["problem"]]
+    assert warning.startswith("1 edges are blocked")
+    assert name in warning
 
 
-def test_formats_that_nobody_plans_on_say_it_themselves() -> None:
-    layers = network(blocked=True)
-    assert warned("geojson", layers) == []
-    made = make.from_layers(formats.get_format("geojson"), layers, {}, derived=False).files
-    assert b'"blocked":true' in b"".join(made.values())
+def test_formats_that_nobody_plans_on_mark_blocked_edges() -> None:
+    written = made("geojson", network(blocked=True))
+    assert not written.report["warnings"]
+    assert b'"blocked":true' in b"".join(written.files.values())

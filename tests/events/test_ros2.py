@@ -459,7 +459,7 @@ def router(tmp_path: Path) -> Iterator[tuple[str, int]]:
 
 
 def version(name: str, root: str) -> Any:
-    return SimpleNamespace(environment=name, number=1, root=root, time=WHEN)
+    return SimpleNamespace(environment=name, number=1, root=root, time=WHEN, closures=None)
 
 
 def test_what_cannot_be_had_leaves_the_last_map_and_is_tried_again(

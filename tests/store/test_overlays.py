@@ -7,10 +7,12 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
+from sqlalchemy import update
 
 from app.errors import Conflict, NotFound
-from app.store import Store, overlays
-from app.store.values import Overlay
+from app.model.closures import NO_CLOSURES
+from app.store import Store, overlays, tables
+from app.store.values import Overlay, rfc3339
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 SQUARE = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1.5], [0, 0]]]}
@@ -41,9 +43,9 @@ def test_an_overlay_waits_and_expires(farm: Store):
     other, new = farm.add_overlay(blocked(reporter="r2", created=NOW + timedelta(seconds=2)))
     assert new
     assert farm.overlays("farm") == [again, edge, other]
-    assert farm.expire_overlays(NOW + timedelta(seconds=59)) == []
+    assert farm.end_due_overlays(NOW + timedelta(seconds=59)) == []
     assert len(farm.overlays("farm", "pending")) == 3
-    assert farm.expire_overlays(NOW + timedelta(seconds=60)) == []
+    assert farm.end_due_overlays(NOW + timedelta(seconds=60)) == []
     assert [o.state for o in farm.overlays("farm")] == ["pending", "expired", "expired"]
     assert farm.overlays("farm", "expired")[0].decided == NOW + timedelta(seconds=60)
     with pytest.raises(NotFound):
@@ -53,23 +55,62 @@ def test_an_overlay_waits_and_expires(farm: Store):
         farm.overlay("yard", first.id)
 
 
-def test_decisions_are_taken_once(farm: Store):
+def test_acceptance_is_in_force_until_the_end_with_an_event_each(farm: Store):
     one, _ = farm.add_overlay(blocked())
+    assert farm.closures("farm").items == ()
+    before = farm.last_sequence("farm")
     accepted = farm.decide_overlay("farm", one.id, "pending", "accepted", "ann", NOW)
     assert (accepted.state, accepted.decided_by, accepted.decided) == ("accepted", "ann", NOW)
     with pytest.raises(Conflict, match="is accepted"):
         farm.decide_overlay("farm", one.id, "pending", "rejected", "bob", NOW)
+    in_force = farm.closures("farm")
+    assert [c.id for c in in_force.items] == [one.id]
+    assert farm.standing("farm", "latest") == (replace(farm.version("farm"), closures=in_force), before + 1)
+    assert farm.standing("farm", 0) == (farm.version("farm", 0), 1), "a version's number is history"
+    assert farm.standing("farm", 0, "apply")[0].closures == in_force
     end = NOW + timedelta(seconds=60)
-    assert farm.expire_overlays(end) == [], "it is not in a version yet"
-    noted = farm.note_overlay_version("farm", one.id, 7)
-    assert noted == replace(accepted, version=7)
-    assert farm.expire_overlays(NOW) == []
-    assert farm.expire_overlays(end) == [noted]
-    assert farm.decide_overlay("farm", one.id, "accepted", "ended", "ann", end).state == "ended"
-    assert farm.expire_overlays(end) == []
+    assert farm.end_due_overlays(NOW) == []
+    assert farm.overlay("farm", one.id).state == "accepted"
+    assert farm.end_due_overlays(end) == []
+    assert (farm.overlay("farm", one.id).state, farm.closures("farm").items) == ("ended", ())
+    assert farm.standing("farm", "latest")[1] == before + 2
+    events = [(e.body["type"], e.body.get("overlays_digest")) for e in farm.events("farm", before)]
+    assert events == [("overlay.accepted", in_force.digest), ("overlay.ended", NO_CLOSURES.digest)]
     again, new = farm.add_overlay(blocked())
     assert new
     assert again.id != one.id
+
+
+def test_editor_creates_accepted_overlay_with_one_event(farm: Store, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(overlays, "MAX_IN_FORCE", 1)
+    one, _ = farm.add_overlay(blocked(state="accepted", decided_by="ann", decided=NOW))
+    assert [e.body["type"] for e in farm.events("farm", 1)] == ["overlay.accepted"]
+    assert [c.id for c in farm.closures("farm").items] == [one.id]
+    with pytest.raises(Conflict, match="1 overlays of farm are in force"):
+        farm.add_overlay(blocked(state="accepted"))
+    waits, _ = farm.add_overlay(blocked(reporter="r9"))
+    with pytest.raises(Conflict, match="in force"):
+        farm.decide_overlay("farm", waits.id, "pending", "accepted", "ann", NOW)
+
+
+def test_marks_of_earlier_releases_are_lifted_for_as_long_as_they_may_stand_in_a_version(farm: Store):
+    """A release before closures put accepted overlays into versions, and a channel may stand on one for years."""
+    area, _ = farm.add_overlay(blocked())
+    edge, _ = farm.add_overlay(blocked(polygon=None, crs=None, edge="a_b"))
+    for one in (area, edge):
+        farm.decide_overlay("farm", one.id, "pending", "accepted", "ann", NOW)
+    table = tables.overlay
+    with farm._database.write() as connection:
+        connection.execute(update(table).values(version=1))
+    end = NOW + timedelta(seconds=60)
+    assert {o.id for o in farm.end_due_overlays(end)} == {area.id, edge.id}, "they are taken out of the newest version"
+    for one in (area, edge):
+        farm.decide_overlay("farm", one.id, "accepted", "ended", "ann", NOW - timedelta(days=400))
+    farm.collect(timedelta(hours=6))
+    found = farm.closures("farm")
+    assert found.items == ()
+    assert found.lifted_edges == {("a_b", rfc3339(end))}
+    assert found.lifted_zones == {f"overlay-{area.id}"}
 
 
 def test_overlays_are_bounded_and_tidied(farm: Store, monkeypatch: pytest.MonkeyPatch):
@@ -87,17 +128,6 @@ def test_overlays_are_bounded_and_tidied(farm: Store, monkeypatch: pytest.Monkey
     farm.purge_environment("farm")
     farm.create_environment("farm")
     assert farm.overlays("farm") == []
-
-
-def test_what_went_into_a_version_is_accepted(farm: Store):
-    """Two editors accept at once; the one who failed takes his decision back before the other's version is noted."""
-    one, _ = farm.add_overlay(blocked())
-    farm.decide_overlay("farm", one.id, "pending", "accepted", "ann", NOW)
-    farm.decide_overlay("farm", one.id, "accepted", "pending", "bob", NOW)
-    noted = farm.note_overlay_version("farm", one.id, 0)
-    assert (noted.state, noted.version) == ("accepted", 0)
-    assert [e.body["type"] for e in farm.events("farm")][-1] == "overlay.accepted"
-    assert [o.id for o in farm.expire_overlays(NOW + timedelta(seconds=61))] == [one.id], "it is taken out again"
 
 
 def test_of_very_many_the_newest_are_listed(farm: Store, monkeypatch: pytest.MonkeyPatch):

@@ -1,0 +1,98 @@
+"""Closures as the requests that planners take while they run, read from the files that these planners have loaded."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import shapely
+import shapely.geometry
+import yaml
+
+from app.errors import MissingDatum
+from app.model.closures import Closure, Closures
+from app.model.frame import GROUND
+from app.model.geodesy import local_frame
+from app.store.values import Version
+
+
+def with_closures(version: Version, closures: Closures | None) -> Version:
+    """The version, its maps showing these closures."""
+    return replace(version, closures=closures)
+
+
+def closed_edges(files: Mapping[str, bytes]) -> list[int]:
+    """Numbers of the edges that a Nav2 route graph marks as blocked, ascending."""
+    graph = json.loads(next(iter(files.values())))
+    edges = (feature["properties"] for feature in graph["features"])
+    return sorted(e["id"] for e in edges if "startid" in e and (e.get("metadata") or {}).get("blocked") is True)
+
+
+def closed_lanes(files: Mapping[str, bytes]) -> dict[str, list[int]]:
+    """Indexes of the lanes that navigation graphs mark as blocked, ascending, by file.
+
+    Counted as rmf_fleet_adapter's parse_graph.cpp counts them: the lanes of all levels in the order of the file; a lane
+    with a dock_name behind a door or lift takes two indexes, the first for the way to a waypoint of its own.
+    """
+    out = {}
+    for name, data in files.items():
+        closed: list[int] = []
+        index = 0
+        for level in yaml.load(data, yaml.CSafeLoader)["levels"].values():
+            in_lift = [bool((vertex[2:3] or [{}])[0].get("lift")) for vertex in level.get("vertices") or ()]
+            for lane in level.get("lanes") or ():
+                said = lane[2] if len(lane) > 2 else {}
+                count = 2 if said.get("dock_name") and _has_entry_event(lane, said, in_lift) else 1
+                if said.get("blocked") is True:
+                    closed += range(index, index + count)
+                index += count
+        out[name] = closed
+    return out
+
+
+def _has_entry_event(lane: Sequence[Any], said: Mapping[str, Any], in_lift: Sequence[bool]) -> bool:
+    """Whether a robot does something before it enters a lane: a lift session, or a door."""
+    begin, end = in_lift[lane[0]], in_lift[lane[1]]
+    if begin or end:
+        return begin is not end
+    return bool("demo_mock_floor_name" in said or "door_name" in said)
+
+
+def zone_sets(version: Version, closures: Closures, map_id: str) -> list[dict[str, Any]]:
+    """Zone sets of VDA 5050 3.0, one for each level with closed areas. Raises MissingDatum for degrees without one.
+
+    Coordinates are local metres, vertices run counter-clockwise. The ground's map is ``map_id``, that of another level
+    ``map_id/LEVEL``.
+    """
+    out = []
+    for level in sorted({c.level for c in closures.items if c.polygon is not None}):
+        zones: list[dict[str, Any]] = []
+        for closure in closures.items:
+            if closure.polygon is None or closure.level != level:
+                continue
+            rings = _outlines(closure, version)
+            for n, ring in enumerate(rings):
+                zone_id = closure.id if len(rings) == 1 else f"{closure.id}/{n}"
+                zones.append({"zoneId": zone_id, "zoneType": "BLOCKED", "vertices": ring})
+        digest = hashlib.sha256(json.dumps(zones, sort_keys=True).encode()).hexdigest()[:16]
+        map_of = map_id if level == GROUND else f"{map_id}/{level}"
+        out.append({"zoneSet": {"zoneSetId": f"{map_of}-{digest}", "mapId": map_of, "zones": zones}})
+    return out
+
+
+def _outlines(closure: Closure, version: Version) -> list[list[dict[str, float]]]:
+    """The outer rings of a closed area, counter-clockwise, without the repeated last point. Holes are closed, too."""
+    shape = shapely.geometry.shape(closure.polygon)
+    if closure.crs == "wgs84":
+        if version.datum is None:
+            raise MissingDatum(f"{version.environment} has no datum, so a closed area in degrees has no local place")
+        shape = local_frame(version.datum).geometries_to_local(shapely.get_parts([shape]))
+    parts = shapely.get_parts(shape)
+    rings = []
+    for polygon in parts:
+        ring = shapely.geometry.polygon.orient(polygon, 1.0).exterior.coords[:-1]
+        rings.append([{"x": round(x, 3), "y": round(y, 3)} for x, y, *_ in ring])
+    return rings

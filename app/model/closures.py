@@ -1,0 +1,75 @@
+"""Closures: edges and areas that nobody may use for a time, on every channel. They are no part of a version."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+ClosureMode = Literal["apply", "mark", "ignore"]
+"""How a map shows closures. ``apply``: closed edges are left out where the format's planners know no word for them.
+``mark``: closed edges stay and are marked. ``ignore``: the map is the version's alone.
+"""
+CLOSURE_MODES: tuple[ClosureMode, ...] = get_args(ClosureMode)
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """One overlay in force: an edge by its id, or a GeoJSON polygon in ``crs``. expires: RFC 3339."""
+
+    id: str
+    kind: str
+    level: str
+    expires: str
+    edge: str | None = None
+    polygon: Mapping[str, Any] | None = None
+    crs: str | None = None
+    detail: str | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-like, without empty members."""
+        members = {
+            "id": self.id,
+            "kind": self.kind,
+            "level": self.level,
+            "expires": self.expires,
+            "edge": self.edge,
+            "polygon": self.polygon,
+            "crs": self.crs,
+            "detail": self.detail,
+        }
+        return {name: value for name, value in members.items() if value is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class Closures:
+    """The closures in force in an environment, sorted by id, and how a map shows them.
+
+    lifted_edges, lifted_zones: marks that releases before closures put into versions, which count no longer: (edge id,
+    its ``blocked_until``) and ids of zones.
+    """
+
+    items: tuple[Closure, ...] = ()
+    mode: ClosureMode = "apply"
+    lifted_edges: frozenset[tuple[str, str]] = frozenset()
+    lifted_zones: frozenset[str] = frozenset()
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) of the list: robots with equal roots and equal digests hold the same map."""
+        return digest_of([closure.as_dict() for closure in self.items])
+
+    def shown(self, mode: ClosureMode) -> Closures | None:
+        """The same in another mode; None where they are ignored."""
+        return None if mode == "ignore" else replace(self, mode=mode)
+
+
+def digest_of(closures: list[dict[str, Any]]) -> str:
+    """SHA-256 (hex) of closures as they stand in a manifest."""
+    data = json.dumps(closures, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    return hashlib.sha256(data.encode()).hexdigest()
+
+
+NO_CLOSURES = Closures()

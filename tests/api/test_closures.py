@@ -1,0 +1,280 @@
+"""Closures on the way out: in force on every channel at once, gone at their end, never in a version."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from app import formats
+from app.model.closures import digest_of
+from tests.api import samples
+from tests.api.conftest import Api
+
+SQUARE = {"type": "Polygon", "coordinates": [[[4, -1], [6, -1], [6, 1], [4, 1], [4, -1]]]}
+"""Across the lane between gate and barn, in metres."""
+
+NO_CLOSURES = digest_of([])
+
+
+def close(api: Api, env: str, **what: Any) -> dict[str, Any]:
+    made: dict[str, Any] = api.post(
+        f"environments/{env}/overlays", {"kind": "blocked", "state": "accepted", **what}
+    ).json()
+    return made
+
+
+def end(api: Api, env: str, overlay: dict[str, Any]) -> None:
+    api.post(f"environments/{env}/overlays/{overlay['id']}/end", expect=200)
+
+
+def edges(text: str) -> set[str]:
+    return {e["edge_id"] for n in yaml.safe_load(text)["nodes"] for e in n["node"]["edges"]}
+
+
+def promote(api: Api, env: str, version: int, channel: str = "production") -> None:
+    api("PUT", f"environments/{env}/channels/{channel}", 200, json={"version": version})
+
+
+def test_closed_edge_leaves_every_channel_and_comes_back(api: Api, farm: str) -> None:
+    promote(api, farm, 2)
+    promote(api, farm, 3, "staging")
+    short = f"/maps/{farm}/tmap2"
+    before = api.get(short)
+    assert before.headers["fleetmap-overlays"] == NO_CLOSURES
+    closure = close(api, farm, edge="gate_barn")
+    places = [short, *(f"environments/{farm}/versions/{v}/maps/tmap2" for v in ("production", "staging", "latest"))]
+    for place in places:
+        answer = api.get(place)
+        assert edges(answer.text) == {"barn_gate", "barn_field"}, place
+        assert answer.headers["fleetmap-overlays"] != NO_CLOSURES
+    assert api.get(short).headers["etag"] != before.headers["etag"]
+    history = api.get(f"environments/{farm}/versions/2/maps/tmap2")
+    assert edges(history.text) == {"gate_barn", "barn_gate", "barn_field"}
+    assert "fleetmap-overlays" not in history.headers
+    assert history.headers["etag"] == before.headers["etag"], "equal content has an equal tag"
+    assert edges(api.get(f"environments/{farm}/versions/2/maps/tmap2?closures=apply").text) == {
+        "barn_gate", "barn_field"
+    }  # fmt: skip
+    assert "gate_barn" in edges(api.get(f"{short}?closures=ignore").text)
+    assert "gate_barn" in edges(api.get(f"{short}?closures=mark").text)
+    assert "closures must be one of" in api.problem("GET", f"{short}?closures=odd", 422)["detail"]
+    end(api, farm, closure)
+    after = api.get(short)
+    assert (after.content, after.headers["etag"]) == (before.content, before.headers["etag"])
+
+
+def test_manifest_lists_closures_and_a_higher_sequence(api: Api, farm: str) -> None:
+    promote(api, farm, 3)
+    place = f"environments/{farm}/versions/production/manifest?formats=tmap2"
+    before = api.get(place).json()
+    assert (before["overlays"], before["overlays_digest"], before["epoch"]) == ([], NO_CLOSURES, 0)
+    one = close(api, farm, edge="gate_barn", detail="a tree")
+    two = close(api, farm, edge="barn_field")
+    now = api.get(place).json()
+    listed = [
+        {"id": o["id"], "kind": "blocked", "level": "ground", "edge": o["edge"], "expires": o["expires"]}
+        | ({"detail": o["detail"]} if "detail" in o else {})
+        for o in sorted((one, two), key=lambda o: str(o["id"]))
+    ]
+    assert now["overlays"] == listed
+    assert now["overlays_digest"] == digest_of(listed) == api.get(f"/maps/{farm}/tmap2").headers["fleetmap-overlays"]
+    assert now["sequence"] == before["sequence"] + 2
+    assert (now["version"], now["root"]) == (before["version"], before["root"])
+    assert now["files"] != before["files"]
+    number = f"environments/{farm}/versions/3/manifest?formats=tmap2"
+    assert api.get(number).json()["overlays"] == []
+    applied = api.get(f"{number}&closures=apply").json()
+    assert (applied["files"], applied["overlays"]) == (now["files"], now["overlays"])
+    for overlay in (one, two):
+        end(api, farm, overlay)
+    again = api.get(place).json()
+    assert (again["files"], again["overlays"], again["sequence"]) == (before["files"], [], before["sequence"] + 4)
+
+
+def test_area_closes_masks_and_the_edges_that_cross_it(api: Api, farm: str) -> None:
+    promote(api, farm, 3)
+    mask = f"/maps/{farm}/occupancy_grid/keepout.pgm"
+    api.problem("GET", mask, 404)
+    closure = close(api, farm, polygon={"type": "Polygon", "coordinates": [[[0, -1], [2, -1], [2, 0.5], [0, -1]]]},
+                    crs="local")  # fmt: skip
+    cells = pgm(api.get(mask).content)
+    assert 3 < (cells == 0).sum() < 20, "black is keepout, in the frame of the map"
+    assert edges(api.get(f"/maps/{farm}/tmap2").text) == {"barn_field"}, "both directions of the lane are closed"
+    report = api.get(f"environments/{farm}/versions/production/reports/tmap2").json()
+    (line,) = report["closures"]
+    assert (line["id"], line["effect"], line["edges"]) == (
+        closure["id"],
+        "left out 2 edges",
+        ["barn_gate", "gate_barn"],
+    )
+    assert {"what": "blocked edges", "count": 2} in [
+        {k: d[k] for k in ("what", "count")} for d in report["dropped"]
+    ]  # fmt: skip
+    (zone,) = [f for f in api.get(f"/maps/{farm}/geojson").json()["features"] if f["id"] == f"overlay-{closure['id']}"]
+    assert (zone["properties"]["kind"], zone["properties"]["expires"]) == ("keepout", closure["expires"])
+    end(api, farm, closure)
+    api.problem("GET", mask, 404)
+
+
+def test_stored_mask_gets_closed_areas_and_grows_where_they_reach_beyond_it(api: Api, farm: str) -> None:
+    api.upload(farm, samples.grid("keepout"), grid="keepout")
+    place = f"/maps/{farm}/occupancy_grid/keepout.pgm"
+    before, size = pgm(api.get(place).content), yaml.safe_load(api.get(place.replace("pgm", "yaml")).content)
+    close(api, farm, polygon=SQUARE, crs="local")
+    after, grown = pgm(api.get(place).content), yaml.safe_load(api.get(place.replace("pgm", "yaml")).content)
+    assert grown["origin"] == size["origin"]
+    assert after.shape == (6, 14), "from x = -1 to x = 6, half a metre a cell"
+    assert np.array_equal(after[:, :8], before)
+    free = 254
+    assert (after[:4, 10:] == 0).all(), "from y = -1 to y = 1, the upper edge of the grid"
+    assert (after[5, 10:] == free).all()
+    assert (after[:, 8:9] == free).all()
+
+
+def test_closed_areas_in_degrees_and_without_a_place(api: Api, farm: str, bare: str) -> None:
+    lon, lat = samples.LONGITUDE + 5 / 66700, samples.LATITUDE
+    d = 1e-5
+    ring = [[lon - d, lat - d], [lon + d, lat - d], [lon + d, lat + d], [lon - d, lat + d], [lon - d, lat - d]]
+    close(api, farm, polygon={"type": "Polygon", "coordinates": [ring]})
+    assert edges(api.get(f"/maps/{farm}/tmap2").text) == {"barn_field"}
+    # An older version without a datum, on a channel: the area has no place there, and its maps are served all the same.
+    api.upload(bare, {"network.tmap2.yaml": samples.tmap2()})
+    promote(api, bare, 1)
+    api.upload(bare, {"datum.yaml": samples.DATUM})
+    close(api, bare, polygon={"type": "Polygon", "coordinates": [ring]})
+    assert len(edges(api.get(f"/maps/{bare}/tmap2").text)) == 3
+    (line,) = api.get(f"environments/{bare}/versions/production/reports/tmap2").json()["closures"]
+    assert line["effect"] == "none"
+
+
+def test_edge_is_closed_until_the_last_of_overlapping_closures_ends(api: Api, farm: str) -> None:
+    first, second = close(api, farm, edge="gate_barn"), close(api, farm, edge="gate_barn", ttl_seconds=60)
+    third = close(api, farm, polygon=SQUARE, crs="local")
+    for overlay in (third, first):
+        end(api, farm, overlay)
+        assert "gate_barn" not in edges(api.get(f"/maps/{farm}/tmap2").text)
+    end(api, farm, second)
+    assert "gate_barn" in edges(api.get(f"/maps/{farm}/tmap2").text)
+
+
+def test_marked_edges_say_until_when(api: Api, farm: str) -> None:
+    closure = close(api, farm, edge="gate_barn")
+    (feature,) = [f for f in api.get(f"/maps/{farm}/geojson").json()["features"] if f["id"] == "gate_barn"]
+    assert (feature["properties"]["blocked"], feature["properties"]["blocked_until"]) == (True, closure["expires"])
+    assert "blocked_until" in api.get(f"/maps/{farm}/kml").text
+    graph = api.get(f"/maps/{farm}/nav2_route?closures=mark").json()
+    assert sum((f["properties"].get("metadata") or {}).get("blocked") is True for f in graph["features"]) == 1
+    report = api.get(f"environments/{farm}/versions/latest/reports/nav2_route?closures=mark").json()
+    assert any("closures=mark" in w["problem"] for w in report["warnings"])
+
+
+NETWORKS = sorted(
+    f.name for f in formats.all_formats().values() if f.write and "topology" in f.carries and not f.marks_blocked
+)
+
+
+@pytest.mark.parametrize("name", [n for n in NETWORKS if n != "environment"])
+def test_closing_an_edge_gives_the_map_that_deleting_it_gives(api: Api, farm: str, fresh: Any, name: str) -> None:
+    other = fresh()
+    api.post("environments", {"name": other, "clone": {"environment": farm, "version": 3}})
+    close(api, farm, edge="gate_barn")
+    gone = {"op": "delete", "layer": "topology", "id": "gate_barn"}
+    api.post(f"environments/{other}/edits", {"changes": [gone]})
+    ours, theirs = (api.get(f"/maps/{env}/{name}").content for env in (farm, other))
+    assert ours.replace(farm.encode(), b"NAME") == theirs.replace(other.encode(), b"NAME")
+
+
+def test_folder_of_maps_applies_closures_inside(api: Api, farm: str) -> None:
+    close(api, farm, edge="gate_barn")
+    archive = zipfile.ZipFile(BytesIO(api.get(f"/maps/{farm}/environment").content))
+    (network,) = [n for n in archive.namelist() if n.endswith(".tmap2.yaml")]
+    assert edges(archive.read(network).decode()) == {"barn_gate", "barn_field"}
+
+
+def test_channels_count_root_and_closures(api: Api, farm: str) -> None:
+    promote(api, farm, 3)
+    robot = api.token_for("robot", robot="mower-8")
+    manifest = api.get(f"environments/{farm}/versions/production/manifest?formats=tmap2").json()
+
+    def report(overlays: str | None) -> None:
+        body = {"environment": farm, "channel": "production", "version": 3, "root": manifest["root"], "state": "active",
+                "overlays": overlays}  # fmt: skip
+        robot("PUT", "robots/mower-8/status", 200, json={k: v for k, v in body.items() if v is not None})
+
+    def production() -> dict[str, Any]:
+        listed = api.get(f"environments/{farm}/channels").json()
+        found: dict[str, Any] = next(c for c in listed if c["channel"] == "production")
+        return found
+
+    report(None)
+    assert production()["robots"]["holding"] == 1, "a robot that knows of no closures holds the map without any"
+    close(api, farm, edge="gate_barn")
+    now = production()
+    assert (now["robots"]["holding"], now["robots"]["lagging"], now["overlays"]["count"]) == (0, 1, 1)
+    lag = api.get(f"robots/mower-8?environment={farm}").json()["lag"]
+    assert (lag["events"], lag["differs"]) == (1, True)
+    report(now["overlays"]["digest"])
+    assert production()["robots"]["holding"] == 1
+    assert api.get(f"robots/mower-8?environment={farm}").json()["holds"]["overlays"] == now["overlays"]["digest"]
+
+
+def test_live_requests_for_planners(api: Api, farm: str) -> None:
+    promote(api, farm, 3)
+    url = f"environments/{farm}/overlays"
+    closure = close(api, farm, edge="gate_barn")
+    area = close(api, farm, polygon=SQUARE, crs="local")
+    graph = api.get(f"environments/{farm}/versions/production/maps/nav2_route?closures=ignore").json()["features"]
+    names = {f["id"]: f["properties"]["id"] for f in graph if "id" in f}
+    marked = api.get(f"{url}/nav2").json()
+    assert len(marked["closed_edges"]) == 2
+    assert marked["opened_edges"] == []
+    del names
+    lanes = api.get(f"{url}/rmf?fleet=mowers").json()["requests"]
+    assert lanes == [
+        {"graph": "0.yaml", "message": {"fleet_name": "mowers", "open_lanes": [], "close_lanes": lanes[0]["message"][
+            "close_lanes"]}}
+    ]  # fmt: skip
+    whole = yaml.safe_load(api.get(f"/maps/{farm}/rmf_nav_graph?closures=ignore").text)["levels"]
+    (level,) = whole.values()
+    ends = [level["lanes"][k][:2] for k in lanes[0]["message"]["close_lanes"]]
+    named = [[level["vertices"][v][2]["name"] for v in pair] for pair in ends]
+    assert sorted(named) == [["barn", "gate"], ["gate", "barn"]]
+    zones = api.get(f"{url}/vda5050").json()
+    (zone_set,) = zones["zoneSets"]
+    (zone,) = zone_set["zoneSet"]["zones"]
+    assert (zone["zoneType"], zone["zoneId"]) == ("BLOCKED", area["id"])
+    ring = [(v["x"], v["y"]) for v in zone["vertices"]]
+    assert len(ring) == 4
+    doubled = sum(x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(ring, ring[1:] + ring[:1], strict=True))
+    assert doubled > 0, "counter-clockwise"
+    assert [e["edgeId"] for e in zones["closedEdges"]] == ["gate_barn"]
+    for overlay in (closure, area):
+        end(api, farm, overlay)
+    again = api.get(f"{url}/nav2").json()
+    assert (again["closed_edges"], again["opened_edges"]) == ([], marked["closed_edges"])
+    opened = api.get(f"{url}/rmf").json()["requests"][0]["message"]
+    assert (opened["close_lanes"], opened["open_lanes"]) == ([], lanes[0]["message"]["close_lanes"])
+
+
+def pgm(data: bytes) -> np.ndarray[Any, Any]:
+    """The pixels of a binary PGM, row 0 on top."""
+    magic, width, height, most, rest = data.split(maxsplit=4)
+    assert (magic, most) == (b"P5", b"255")
+    count = int(width) * int(height)
+    return np.frombuffer(rest[-count:] if len(rest) >= count else data[-count:], np.uint8).reshape(
+        int(height), int(width)
+    )
+
+
+def test_closures_are_listed_with_their_ends_as_signed(api: Api, farm: str) -> None:
+    close(api, farm, polygon=SQUARE, crs="local", detail="ä trailer")
+    body = api.get(f"environments/{farm}/versions/latest/manifest?formats=geojson").content
+    listed = json.loads(body)
+    assert listed["overlays_digest"] == digest_of(listed["overlays"])
+    assert listed["overlays"][0]["polygon"] == json.loads(json.dumps(SQUARE))
