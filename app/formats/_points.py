@@ -396,8 +396,8 @@ FRAME_DOC = (
     "source: coordinates as uploaded; local: metres in the local frame; default: source in the format that was "
     "uploaded, local in others"
 )
-NAME_DOC = "name of the voxel map; default: map, else the only one"
-LEVEL_DOC = "level of the voxel map; default: the one it is on"
+NAME_DOC = "name of the voxel map; *: all; default: map, else the only one"
+LEVEL_DOC = "level of the voxel map; *: all; default: the one it is on"
 
 MOST = 2**25
 """Points that voxels are made into at most."""

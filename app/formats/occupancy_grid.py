@@ -30,6 +30,7 @@ from app.formats import (
     Format,
     Limits,
     Needs,
+    Parts,
     ReadContext,
     WriteContext,
     _image,
@@ -41,7 +42,7 @@ from app.formats import (
 from app.formats._choice import the_one
 from app.model.frame import MAX_METRES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, Mode, OccupancyGrid, outline
-from app.model.layers import MAP, Layer, Layers, PartKey
+from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
 
 NAME = "occupancy_grid"
@@ -83,8 +84,8 @@ class ReadOptions:
 class WriteOptions:
     """Which grid, and how it is written."""
 
-    grid: str | None = parameter(None, "name of the grid; default: map, else the only one")
-    level: str | None = parameter(None, "level of the grid; default: the one it is on")
+    grid: str | None = parameter(None, "name of the grid; *: all, drawn masks too; default: map, else the only one")
+    level: str | None = parameter(None, "level of the grid; *: all; default: the one it is on")
     file_type: Literal["pgm", "png"] | None = parameter(
         None, "picture format; default: pgm, or png where only transparency can say unknown"
     )
@@ -371,11 +372,6 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     return the_one(keys, "occupancy", options.grid, options.level, what="grid", option="grid", supply=supply)
 
 
-def named(options: WriteOptions) -> tuple[Layer, str] | None:
-    """The grid that is asked for by name."""
-    return ("occupancy", options.grid) if options.grid is not None else None
-
-
 def by_file(name: str) -> dict[str, str]:
     """``keepout.yaml``, ``keepout.pgm`` and ``keepout_filter_info.yaml`` are the grid ``keepout``; ``keepout.png`` asks
     for a PNG, too."""
@@ -648,7 +644,7 @@ register(
         write_options=WriteOptions,
         choose=choose,
         by_file=by_file,
-        named=named,
+        parts=Parts("occupancy", "grid"),
         check=_occupancy_grid_rules.check,
         rank=40,
         version=2,

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.errors import Invalid, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext, _image, _raster, _xml, register
+from app.formats import Files, Format, Limits, Needs, Parts, ReadContext, WriteContext, _image, _raster, _xml, register
 from app.formats._choice import the_one
 from app.formats._text import DEGREES, METRES
 from app.model.frame import MAX_METRES, is_writable
@@ -96,8 +96,8 @@ class ReadOptions:
 class WriteOptions:
     """Which picture, and how it is written."""
 
-    picture: str | None = parameter(None, "name of the picture; default: satellite, else the only one")
-    level: str | None = parameter(None, "level of the picture; default: the one it is on")
+    picture: str | None = parameter(None, "name of the picture; *: all; default: satellite, else the only one")
+    level: str | None = parameter(None, "level of the picture; *: all; default: the one it is on")
     file_type: Literal["tif", "png"] | None = parameter(
         None, "tif: a cloud optimized GeoTIFF with everything (default); png: 8 bit with a world file"
     )
@@ -534,6 +534,7 @@ register(
         extensions=IMAGE_ENDS,
         choose=choose,
         by_file=by_file,
+        parts=Parts("imagery", "picture", default=NAME),
         yields=yields,
         lacking=lacking,
         completing=frozenset({"corners", "metres_per_pixel"}),
