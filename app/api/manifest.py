@@ -207,7 +207,7 @@ def _listed(
 def _recipe(here: Services, version: Version, entry: _Entry) -> Recipe:
     """Plan the whole site in a format, or what the entry's parameters select of it."""
     values = {**site.everything(formats.get_format(entry.format)), **entry.values}
-    return here.maps.recipe(version, entry.format, values, derive=entry.derive, archive=False)
+    return here.maps.recipe(version, entry.format, values, derive=entry.derive, listed=True)
 
 
 def _named(error: FleetMapError, entry: _Entry) -> FleetMapError:

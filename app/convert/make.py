@@ -108,7 +108,7 @@ def write(
         if not spread.optional:
             raise
         if isinstance(error.__cause__, MissingLayer):
-            return Written({}, _empty_report(known))
+            return Written({}, empty_report(known))
         raise CannotConvert(error.detail, error.problems) from error
     return _written_each(known, made, options, source, notes, spread)
 
@@ -147,10 +147,11 @@ def _written_each(
         for name, data in one.files.items():
             files.setdefault(folder + name, data)
             places.setdefault(folder + name, (key.level, key.name))
-    return Written(files, site.merged_report(reports) if reports else _empty_report(known), places)
+    return Written(files, site.merged_report(reports) if reports else empty_report(known), places)
 
 
-def _empty_report(known: Format) -> dict[str, Any]:
+def empty_report(known: Format) -> dict[str, Any]:
+    """Build the report of a map without files."""
     empty: dict[str, Any] = {"layers": [], "attribution": [], "template": [], "dropped": [], "warnings": []}
     return {"format": known.name, **empty}
 

@@ -72,13 +72,13 @@ class Maps:
         *,
         derive: bool = True,
         file: str | None = None,
-        archive: bool = True,
+        listed: bool = False,
     ) -> Recipe:
         """How the map would be made; cheap. Raises NotFound, Invalid, MissingLayer, MissingDatum, Ambiguous.
 
         values: what the request says; the environment's templates say the rest. file: the one file of the map that is
         wanted; its name may say more (``keepout.yaml`` is the grid keepout, ``L2/map.yaml`` the one of the level L2).
-        archive: whether a map of several parts is wanted as one zip, or only its files.
+        listed: as in a manifest: files are named as those of the whole site, and no zip of them is made.
         """
         known = formats.get_format(name)
         values = values or {}
@@ -93,9 +93,9 @@ class Maps:
                     found = site.file_recipe(version, known, asked, file, derived=derive, without=without)
                     if found is not None:
                         return found
-                elif site.asks_for_all(known, values):
+                elif listed or site.asks_for_all(known, values):
                     asked = {**filled.values, **values}
-                    return site.recipe(version, known, asked, derived=derive, without=without, archive=archive)
+                    return site.recipe(version, known, asked, derived=derive, without=without, archive=not listed)
             hints = known.by_file(file) if file is not None else {}
             asked = {**filled.values, **hints, **site.one_of(known, values)}
             return recipes.recipe(version, name, asked, derived=derive, without=without)
@@ -168,7 +168,7 @@ class Maps:
         """A map of several: each is made by itself. Those that are there already stay while the others are made."""
         with self.cache.holding() as hold:
             held = [self._held(member.recipe, hold, stop) for member in recipe.members]
-            return self.cache.get_or_make(recipe.key, lambda: _joined(recipe, held))
+            return self.cache.get_or_make(recipe.key, lambda: joined(recipe, held))
 
     def _held(self, recipe: Recipe, hold: Callable[[Made], Made], stop: Stop | None) -> Made:
         for _ in range(HOLD_ATTEMPTS):
@@ -216,7 +216,9 @@ class Maps:
     def report(self, recipe: Recipe) -> dict[str, Any]:
         """What was raw, derived, filled in and dropped: the contract's report, for this version."""
         if recipe.members:
-            return site.merged_report([(member.folder, self.report(member.recipe)) for member in recipe.members])
+            clashes = {**making.empty_report(recipe.format), "dropped": self.make(recipe).report["dropped"]}
+            members = [(member.folder, self.report(member.recipe)) for member in recipe.members]
+            return site.merged_report([*members, ("", clashes)])
         told = self.make(recipe).report
         entries = {(e.key.layer, e.key.level, e.key.name): e.provenance for e in recipe.version.parts}
         anew = {step.gives for step in recipe.steps}
@@ -415,23 +417,29 @@ def file_of(recipe: Recipe, made: Made, file: str | None) -> MadeFile:
     return found
 
 
-def _joined(recipe: Recipe, held: Sequence[Made]) -> Product:
+def joined(recipe: Recipe, held: Sequence[Made]) -> Product:
     """The files of all members, each at its place; of two of one name the first stays, and the report says so."""
     files: dict[str, tuple[bytes | Path, str]] = {}
     places: dict[str, tuple[str, str]] = {}
+    clashes: list[dict[str, Any]] = []
     for member, made in zip(recipe.members, held, strict=True):
         for file in site.select(made.files, member):
             name = member.folder + file.name
-            if name not in files:
-                files[name] = (file.path, file.media_type)
-                places[name] = file.place or member.place or ("", "")
+            place = file.place or member.place
+            if name in files:
+                why = f"a file of {places[name][1]!r} has the same name: rename one of the two"
+                clashes.append({"what": f"file {name} of {place[1] if place else name!r}", "count": 1, "why": why})
+                continue
+            files[name] = (file.path, file.media_type)
+            if place is not None:
+                places[name] = place
     if not files:
         raise site.nothing_made(recipe)
     archive = None
     if recipe.archive and len(files) > 1:
         archive = (f"{recipe.format.name}.zip", making.zipped(_Contents({n: p for n, (p, _) in files.items()})))
     report = site.merged_report([(m.folder, made.report) for m, made in zip(recipe.members, held, strict=True)])
-    return Product(files, archive, report, places)
+    return Product(files, archive, {**report, "dropped": [*report["dropped"], *clashes]}, places)
 
 
 class _Contents(Mapping[str, bytes]):

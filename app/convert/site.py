@@ -24,11 +24,14 @@ from app.derive import Derivation
 from app.errors import NotFound
 from app.formats import Format, Parts
 from app.model.frame import GROUND
-from app.model.layers import MAP, PartKey
+from app.model.layers import MAP, Layer, PartKey
 from app.store.values import Version
 
 EVERY = "*"
 """The value of an option that selects all: levels, or parts by name."""
+
+SITE_WIDE: frozenset[Layer] = frozenset({"location", "resources"})
+"""Layers that are of all levels, whichever one they are stored on."""
 
 MAX_FOLDER_BYTES = 120
 DIGEST_DIGITS = 16
@@ -144,7 +147,8 @@ def _default_level(version: Version, stored: Sequence[PartKey], main: Chain | No
     """``ground`` where the format's parts are there (too), else the lowest level that has one."""
     levels = {key.level for key in stored}
     if main is not None:
-        levels = {key.level for key in main.keys if key.layer != "location"} or {key.level for key in main.keys}
+        placed = {key.level for key in main.keys if key.layer not in SITE_WIDE}
+        levels = placed or {key.level for key in main.keys}
     if not levels or GROUND in levels:
         return GROUND
     heights = {level.name: level.elevation for level in version.levels}
@@ -192,6 +196,7 @@ def _stored_members(site: _Site, levels: frozenset[str] | None, name: str | None
         if levels is not None and level not in levels:
             continue
         here = [key.name for key in site.stored if key.level == level]
+        here.sort(key=lambda one: (site.parts.stem(one) != one, one))  # of two with equal file names the first is kept
         wanted: list[str | None] = [None]
         if name == EVERY:
             usual = default_name(site.parts, here)
@@ -305,7 +310,8 @@ def file_recipe(
         levels = ", ".join(sorted(site.levels))
         raise NotFound(f"{fmt.name} has no file {file!r}: no level has this folder; there are the levels {levels}")
     hints = dict(fmt.by_file(base))
-    name = name or hints.get(parts.name)
+    if name is None and parts.name in hints:
+        name = _named_like(site, of_file, hints[parts.name])
     maker = site.maker_of(name, of_file) if name is not None else None
     if maker is not None:
         if base.rpartition(".")[2] not in {end.rpartition(".")[2] for end in fmt.files}:
@@ -317,8 +323,18 @@ def file_recipe(
     if not folder and not _is_at_top(site, name):
         return None
     selected: dict[str, Any] = {parts.level: of_file} | ({} if name is None else {parts.name: name})
-    found = recipes.recipe(version, fmt.name, {**hints, **rest, **selected}, derived=derived, without=without)
+    found = recipes.recipe(
+        version, fmt.name, {**hints, **site.own_values, **selected}, derived=derived, without=without
+    )
     return replace(found, file=base)
+
+
+def _named_like(site: _Site, level: str, stem: str) -> str:
+    """The stored part of a level whose files have this name: its own name, where it may stand in a file's."""
+    names = [key.name for key in site.stored if key.level == level]
+    if stem in names:
+        return stem
+    return next((name for name in names if site.parts.stem(name) == stem), stem)
 
 
 def _is_at_top(site: _Site, name: str | None) -> bool:

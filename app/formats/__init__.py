@@ -161,12 +161,14 @@ class NoOptions:
 class Parts:
     """For formats whose files hold one part of a layer each: the write options that select the part.
 
-    name: the option with the part's name. level: the option with its level. default: the name of the part that is
-    written where no name is given. So ``*`` for either option gives every part (``app.convert.site``).
+    name: the option with the part's name. stem: a part's name -> that of its files, without the ending. level: the
+    option with its level. default: the name of the part that is written where no name is given. So ``*`` for either
+    option gives every part (``app.convert.site``).
     """
 
     layer: Layer
     name: str
+    stem: Callable[[str], str]
     level: str = "level"
     default: str = MAP
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from app.formats import Files, Format, Needs, Parts, ReadContext, WriteContext, _las, _points, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _las, _points, register
 from app.formats._clouds import PARSERS
 from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
@@ -87,6 +87,6 @@ register(
         extensions=(".las", ".laz"),
         choose=choose,
         by_file=by_file,
-        parts=Parts("voxels", "name"),
+        parts=_points.PARTS,
     )
 )

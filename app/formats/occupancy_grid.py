@@ -39,7 +39,7 @@ from app.formats import (
     _yaml,
     register,
 )
-from app.formats._choice import the_one
+from app.formats._choice import file_stem, the_one
 from app.model.frame import MAX_METRES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, Mode, OccupancyGrid, outline
 from app.model.layers import MAP, Layers, PartKey
@@ -355,8 +355,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         grid = resampled(grid, options.resolution)
     if options.normalize:
         grid = normalized(grid)
-    # A second character ":" would make a Windows drive of it, which no archive may hold.
-    stem = re.sub(r"[/\\\x00-\x1f]|(?<=^.):", "_", key.name.lstrip(".")) or MAP
+    stem = file_stem(key.name)
     grid, pixels, kind = _encoding(grid, options, context, stem + ".yaml")
     if grid.origin[2] != 0.0:
         reason = f"the origin is turned by {grid.origin[2]:g} rad; Nav2 ignores that: ask for normalize=true"
@@ -644,7 +643,7 @@ register(
         write_options=WriteOptions,
         choose=choose,
         by_file=by_file,
-        parts=Parts("occupancy", "grid"),
+        parts=Parts("occupancy", "grid", file_stem),
         check=_occupancy_grid_rules.check,
         rank=40,
         version=2,

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from app.formats import Files, Format, Needs, Parts, ReadContext, WriteContext, _ply, _points, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _ply, _points, register
 from app.formats._clouds import PARSERS
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
@@ -74,6 +74,6 @@ register(
         extensions=(".ply",),
         choose=choose,
         by_file=_points.by_file((NAME,)),
-        parts=Parts("voxels", "name"),
+        parts=_points.PARTS,
     )
 )

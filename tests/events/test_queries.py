@@ -78,13 +78,13 @@ def test_a_map_in_the_making_keeps_nobody_waiting(
     api.post("environments", {"name": "busy"})
     api.upload("busy", {"network.tmap2.yaml": samples.tmap2()})
     go, maps, late = threading.Event(), api.app.state.services.maps, []
-    make = maps.at_once
+    make = maps.fetch
 
     def slow(*asked: Any, **more: Any) -> Any:
         assert go.wait(30)
         return make(*asked, **more)
 
-    monkeypatch.setattr(maps, "at_once", slow)
+    monkeypatch.setattr(maps, "fetch", slow)
     try:
         for _ in range(10):
             session.get("fleetmap/busy/latest/maps/geojson/map.geojson", late.append, timeout=30.0)
