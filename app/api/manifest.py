@@ -86,7 +86,7 @@ async def get_manifest(
         Query(
             description="Further formats, written in the same way. Those that cannot be given are listed in `missing`.",
             max_length=MAX_LIST,
-            examples=["kml"],
+            examples=["lanelet2"],
         ),
     ] = "",
 ) -> Response:
