@@ -26,7 +26,8 @@ from app.api.protocol import ON_STOP
 from app.api.schemas import told
 from app.api.services import Here, Services
 from app.api.together import Together
-from app.convert.cache import Made
+from app.convert.cache import MadeFile
+from app.convert.maps import file_of
 from app.errors import Invalid, NotFound, Problem, TooLarge, Unauthenticated, Unavailable
 from app.events.bus import Answer, Make
 from app.store.values import Event
@@ -276,17 +277,14 @@ def ask(here: Services, most: int, environment: str, rest: str, parameters: Mapp
     mode = closure_mode(values.pop("closures", None))
     version, _ = here.store.standing(environment, number_of(pieces[0]), mode)
     name, file = pieces[2], "/".join(pieces[3:]) or None
-    made = here.maps.ready(here.maps.recipe(version, name, values, derive=derive == "true", file=file))
+    recipe = here.maps.recipe(version, name, values, derive=derive == "true", file=file)
+    made = here.maps.ready(recipe)
     if made is not None:
-        return _file_of(made, file, most)
-    return lambda: _file_of(here.maps.at_once(version, name, values, derive=derive == "true", file=file), file, most)
+        return _answer_of(file_of(recipe, made, file), most)
+    return lambda: _answer_of(here.maps.fetch(version, name, values, derive=derive == "true", file=file), most)
 
 
-def _file_of(made: Made, name: str | None, most: int) -> Answer:
-    found = made.whole() if name is None else made.file(name)
-    if found is None:
-        names = ", ".join(f.name for f in made.files[:20])
-        raise NotFound(f"this map has no file {name!r}; its files are: {names}")
+def _answer_of(found: MadeFile, most: int) -> Answer:
     if found.size > most:
         raise TooLarge(f"the map has {found.size} bytes, more than is sent over Zenoh ({most}): fetch it over HTTP")
     return Answer(found.path.read_bytes(), found.media_type)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import dataclasses
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
@@ -19,12 +19,13 @@ from app.api.access import Admin, Viewer
 from app.api.answers import Route, answer, json_bytes
 from app.api.caching import none_match
 from app.api.jobs import Started, started
-from app.api.maps import address_of, number_of
+from app.api.maps import address_of, number_of, options_of
 from app.api.schemas import Closing, EnvironmentPath, KeyOut, ManifestOut, VersionPath, told
 from app.api.services import Here, Services
-from app.convert import Recipe
+from app.convert import Recipe, site
 from app.convert.cache import Made
-from app.errors import CannotDerive, Invalid, NotFound, Problem
+from app.convert.recipe import own_options
+from app.errors import CannotConvert, CannotDerive, FleetMapError, Invalid, NotFound, Problem
 from app.events.messages import SIGNATURE
 from app.model.closures import NO_CLOSURES, ClosureMode
 from app.store.values import Version, frame_line, rfc3339
@@ -33,6 +34,12 @@ STEP_SECONDS = 600
 """The time of expiry moves in steps, so that a robot that polls gets the same bytes, and 304."""
 
 MAX_FORMATS = 32
+MAX_LIST = 4000
+"""Characters of a list of formats with their parameters."""
+
+UNAVAILABLE = (CannotConvert, NotFound, Invalid)
+"""Why a format cannot be given. Anything else concerns the whole request."""
+
 LAYER_DIGITS = 16
 
 router = APIRouter(tags=["manifest"], route_class=Route)
@@ -68,47 +75,82 @@ async def get_manifest(
     formats: Annotated[
         str,
         Query(
-            description="Formats, separated by commas; of grids all are listed.",
-            max_length=1000,
+            description="Formats, comma-separated. Each may carry parameters as in an address: "
+            "`occupancy_grid?level=L2&grid=map,tmap2`; a comma or `&` in a value is percent-encoded once more. "
+            "Default of a format that has levels and named parts: all of them.",
+            max_length=MAX_LIST,
             examples=["geojson,kml"],
         ),
     ],
+    optional: Annotated[
+        str,
+        Query(
+            description="Further formats, written in the same way. Those that cannot be given are listed in `missing`.",
+            max_length=MAX_LIST,
+            examples=["lanelet2"],
+        ),
+    ] = "",
     closures: Closing = None,
 ) -> Response:
     """Names, sizes and hashes of the files of maps, signed with the server's key over exactly these bytes.
 
     The header `Fleetmap-Signature` is `<key id>:<base64 of the Ed25519 signature>`; `/keys` has the keys. `sequence`
     is that of the event that brought the channel (or the version) there, or that last changed which closures are in
-    force: a robot refuses a lower one.
+    force: a robot refuses a lower one. Files of a level other than the default one are below a folder of its name;
+    `level` names a file's level.
     """
-    names = _names(formats)
+    entries = _entries(formats, optional)
     made: dict[str, Made] = {}
     while True:
-        found = await here.hot.shared(request, _signed, here, env, v, names, closures, request, {})
-        if isinstance(found, Recipe) and found.key in made:  # the cache has no room for all of them at once
-            found = await run_in_threadpool(_signed, here, env, v, names, closures, request, made)
-        if not isinstance(found, Recipe):
+        found = await here.hot.shared(request, _signed, here, env, v, entries, closures, request, {})
+        if isinstance(found, _Unmade) and found.recipe.key in made:  # the cache has no room for all of them at once
+            found = await run_in_threadpool(_signed, here, env, v, entries, closures, request, made)
+        if not isinstance(found, _Unmade):
             break
-        outcome = await _made(here, found, request, who)
+        try:
+            outcome = await _made(here, found.recipe, request, who)
+        except UNAVAILABLE as error:
+            if found.entry.required:
+                raise _named(error, found.entry) from error
+            continue  # it is remembered: the next look lists it as missing
         if isinstance(outcome, Started):
             return started(outcome.job)
         if outcome is not None:
-            made[found.key] = outcome
+            made[found.recipe.key] = outcome
     headers, data = found
     if none_match(request.headers.get("if-none-match"), headers["etag"]):
         return Response(status_code=304, headers=headers)
     return Response(data, 200, headers, "application/json")
 
 
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """A format of the request, with the parameters of its maps."""
+
+    format: str
+    values: Mapping[str, str]
+    derive: bool
+    closures: ClosureMode | None
+    required: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Unmade:
+    """A map that is to be made before the manifest can be written."""
+
+    entry: _Entry
+    recipe: Recipe
+
+
 def _signed(
     here: Services,
     env: str,
     v: str,
-    names: list[str],
+    entries: list[_Entry],
     mode: ClosureMode | None,
     request: Request,
     known: Mapping[str, Made],
-) -> tuple[dict[str, str], bytes] | Recipe:
+) -> tuple[dict[str, str], bytes] | _Unmade:
     """The headers and the signed bytes; the first map that is to be made before that can be said.
 
     known: maps that were made for this answer, by their recipes' keys: they may have left the cache again.
@@ -117,18 +159,10 @@ def _signed(
     generation = here.hot.generation()
     version, sequence = here.store.standing(env, number_of(v), mode)
     closures = version.closures or NO_CLOSURES
-    files: list[dict[str, Any]] = []
-    for name in names:
-        seen: set[str] = set()
-        for values in _variants(name, version):
-            recipe = here.maps.recipe(version, name, values)
-            made = here.maps.ready(recipe) or known.get(recipe.key)
-            if made is None:
-                return recipe
-            for file in made.files:
-                if file.name not in seen:
-                    seen.add(file.name)
-                    files.append({"format": name, "name": file.name, "size": file.size, "sha256": file.sha256})
+    listed = _listed(here, version, entries, known)
+    if isinstance(listed, _Unmade):
+        return listed
+    files, missing = listed
     now = datetime.now(UTC).timestamp()
     signed = (int(now) // STEP_SECONDS) * STEP_SECONDS
     body: dict[str, Any] = {"environment": env}
@@ -141,7 +175,9 @@ def _signed(
         "root": version.root,
         "time": rfc3339(datetime.fromtimestamp(signed, UTC)),
         "expires": rfc3339(datetime.fromtimestamp(signed + here.options.manifest_seconds, UTC)),
-        "files": sorted(files, key=lambda f: (f["format"], f["name"])),
+        "levels": _levels(version),
+        "files": files,
+        "missing": missing,
         "overlays": [closure.as_dict() for closure in closures.items],
         "overlays_digest": closures.digest,
         "layers": _layers(version),
@@ -157,6 +193,54 @@ def _signed(
     return headers, data
 
 
+def _listed(
+    here: Services, version: Version, entries: list[_Entry], known: Mapping[str, Made]
+) -> tuple[list[dict[str, Any]], list[dict[str, str]]] | _Unmade:
+    """The files of all formats, and the optional formats that cannot be given; or a map that is to be made first."""
+    files: list[dict[str, Any]] = []
+    missing: list[dict[str, str]] = []
+    for entry in entries:
+        try:
+            recipe = _recipe(here, version, entry)
+            made = here.maps.ready(recipe) or known.get(recipe.key)
+            failure = None if made is not None or entry.required else here.maps.failure(recipe)
+            if failure is not None:
+                raise failure
+        except UNAVAILABLE as error:
+            if entry.required:
+                raise _named(error, entry) from error
+            missing.append({"format": entry.format, "detail": error.detail})
+            continue
+        if made is None:
+            return _Unmade(entry, recipe)
+        for file in made.files:
+            line = {"format": entry.format, "name": file.name, "size": file.size, "sha256": file.sha256}
+            files.append(line | ({"level": file.place[0]} if file.place is not None else {}))
+    return sorted(files, key=lambda f: (f["format"], f["name"])), sorted(missing, key=lambda m: m["format"])
+
+
+def _recipe(here: Services, version: Version, entry: _Entry) -> Recipe:
+    """Plan the whole site in a format, or what the entry's parameters select of it."""
+    values = {**site.everything(formats.get_format(entry.format)), **entry.values}
+    if entry.closures is not None:
+        in_force = version.closures or here.store.closures(version.environment)
+        version = replace(version, closures=in_force.shown(entry.closures))
+    return here.maps.recipe(version, entry.format, values, derive=entry.derive, listed=True)
+
+
+def _named(error: FleetMapError, entry: _Entry) -> FleetMapError:
+    """The same error, saying which format cannot be given."""
+    if entry.format in error.detail:
+        return error
+    return type(error)(f"{entry.format}: {error.detail}", error.problems)
+
+
+def _levels(version: Version) -> list[dict[str, Any]]:
+    """The levels from the lowest up; one that only parts name is at 0 m."""
+    heights = {entry.key.level: 0.0 for entry in version.parts} | {one.name: one.elevation for one in version.levels}
+    return [{"name": name, "elevation": heights[name]} for name in sorted(heights, key=lambda n: (heights[n], n))]
+
+
 def _layers(version: Version) -> dict[str, str]:
     """A hash of each layer's content: who has two manifests knows which layers differ, without asking anybody."""
     parts: dict[str, list[Any]] = {}
@@ -168,28 +252,36 @@ def _layers(version: Version) -> dict[str, str]:
     return {name: hashlib.sha256(json_bytes(lines)).hexdigest()[:LAYER_DIGITS] for name, lines in sorted(parts.items())}
 
 
-def _names(text: str) -> list[str]:
-    names = list(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
-    if not names or len(names) > MAX_FORMATS:
-        raise Invalid(f"name 1 to {MAX_FORMATS} formats, separated by commas", [Problem("empty", where="formats")])
-    for name in names:
-        try:
-            known = formats.get_format(name)
-        except NotFound as error:
-            raise Invalid(error.detail, [Problem("no such format", where="formats")]) from None
-        if known.write is None:
-            raise Invalid(f"{name} is not served", [Problem("not served", where="formats")])
-    return names
+def _entries(required: str, optional: str) -> list[_Entry]:
+    """The formats of a request. Invalid for unknown ones, for what is named twice, and for unreadable parameters."""
+    entries = [_entry(text, "formats", required=True) for text in required.split(",") if text.strip()]
+    if not entries:
+        raise Invalid(f"name 1 to {MAX_FORMATS} formats, comma-separated", [Problem("empty", where="formats")])
+    entries += [_entry(text, "optional", required=False) for text in optional.split(",") if text.strip()]
+    names = [entry.format for entry in entries]
+    if len(names) > MAX_FORMATS:
+        raise Invalid(f"name 1 to {MAX_FORMATS} formats, comma-separated", [Problem("too many", where="formats")])
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        reason = f"the format {twice} is named twice: give each format once"
+        raise Invalid(reason, [Problem(reason, where="formats")])
+    return entries
 
 
-def _variants(name: str, version: Version) -> list[dict[str, str]]:
-    """The options under which a robot may fetch files of a format by their names alone: each grid on its own."""
-    known = formats.get_format(name)
-    own = {f.name for f in dataclasses.fields(known.write_options)}
-    grids = sorted({e.key.name for e in version.parts if e.key.layer == "occupancy" and e.count})
-    if "occupancy" in known.carries and "grid" in own and known.by_file("keepout.yaml") and len(grids) > 1:
-        return [{"grid": grid} for grid in grids]
-    return [{}]
+def _entry(text: str, where: str, *, required: bool) -> _Entry:
+    name, _, query = text.strip().partition("?")
+    try:
+        fmt = formats.get_format(name)
+    except NotFound as error:
+        raise Invalid(error.detail, [Problem("no such format", where=where)]) from None
+    if fmt.write is None:
+        raise Invalid(f"{name} is not served", [Problem("not served", where=where)])
+    try:
+        values, derive, closures = options_of(query)
+        own_options(fmt, values)
+    except Invalid as error:
+        raise Invalid(f"{name}: {error.detail}", error.problems) from None
+    return _Entry(name, values, derive, closures, required)
 
 
 async def made_for(

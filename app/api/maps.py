@@ -36,6 +36,7 @@ from app.api.services import Here, Services
 from app.api.together import Together
 from app.convert import Recipe
 from app.convert.cache import Made, MadeFile
+from app.convert.maps import file_of
 from app.errors import CannotDerive, Invalid, NotFound, Problem
 from app.model.closures import CLOSURE_MODES, ClosureMode
 from app.store.values import LATEST, Version
@@ -285,11 +286,8 @@ def number_of(ref: str) -> str | int:
 
 def _filled(empty: Resource, made: Made) -> Resource:
     """With headers and content of the made map. NotFound where it has no such file."""
-    name = empty.wanted.file
-    file = made.whole() if name is None else made.file(name)
-    if file is None:
-        names = ", ".join(f.name for f in made.files[:20])
-        raise NotFound(f"this map has no file {name!r}; its files are: {names}")
+    assert empty.recipe is not None
+    file = file_of(empty.recipe, made, empty.wanted.file)
     headers = [
         (b"content-type", _media_type(file).encode()),
         (b"accept-ranges", b"bytes"),
@@ -348,7 +346,16 @@ def _options(query: bytes) -> tuple[dict[str, str], bool, ClosureMode | None]:
     given twice.
     """
     try:
-        pairs = parse_qsl(query.decode("ascii"), keep_blank_values=True, max_num_fields=100, errors="strict")
+        text = query.decode("ascii")
+    except UnicodeDecodeError:
+        raise Invalid("the query cannot be read: it must be percent-encoded UTF-8") from None
+    return options_of(text)
+
+
+def options_of(query: str) -> tuple[dict[str, str], bool, ClosureMode | None]:
+    """The same of a query that is text, as a manifest's entries hold one."""
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, max_num_fields=100, errors="strict")
     except ValueError:
         raise Invalid("the query cannot be read: it must be percent-encoded UTF-8 with at most 100 members") from None
     values: dict[str, str] = {}

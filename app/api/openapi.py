@@ -179,7 +179,9 @@ def _map_paths(paths: dict[str, Any]) -> None:
             "summary": summary,
             "operationId": "get_" + "_".join(["map", *(["file"] if extra else []), *(["short"] if short else [])]),
             "description": f"{describing}{short} Derives what is missing. Ask again with `If-None-Match`: it costs "
-            "nothing. `Link` names the report on what was raw, derived, filled in or dropped.",
+            "nothing. `Link` names the report on what was raw, derived, filled in or dropped. Where a format has parts "
+            "by level and name, `*` gives all of them: `?level=*&grid=*`; files of other levels than the default one "
+            "are below a folder of the level's name (`L2/map.yaml`).",
             "parameters": [_path_parameter(name) for name in names] + _query_parameters() + _header_parameters(),
             "responses": {
                 "200": {"description": describing, "headers": _HEADERS, "content": content},

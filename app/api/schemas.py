@@ -795,9 +795,24 @@ class ManifestFile(BaseModel):
     """One file of a map."""
 
     format: str
-    name: str
+    name: str = Field(description="Below the folder of its level, where that is not the default one: `L2/map.yaml`.")
     size: int
     sha256: str
+    level: str | None = Field(None, description="Of a file that belongs to one level.")
+
+
+class ManifestLevel(BaseModel):
+    """A storey."""
+
+    name: str
+    elevation: float = Field(description="Metres above the local origin.")
+
+
+class ManifestMissing(BaseModel):
+    """An optional format that cannot be given."""
+
+    format: str
+    detail: str = Field(description="Why, and what to supply.")
 
 
 class ManifestOut(BaseModel):
@@ -811,7 +826,9 @@ class ManifestOut(BaseModel):
     root: str
     time: datetime = Field(description="When it was signed, in steps of ten minutes.")
     expires: datetime
+    levels: list[ManifestLevel] = Field(description="From the lowest up.")
     files: list[ManifestFile]
+    missing: list[ManifestMissing]
     overlays: list[dict[str, Any]] = Field(description="The closures in force that its files show, by id.")
     overlays_digest: str = Field(description="SHA-256 of that list; `Fleetmap-Overlays` of each file.")
     layers: dict[str, str] = Field(description="A hash of each layer: equal where the layer is, in any two versions.")

@@ -13,7 +13,7 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,13 +27,14 @@ FRESH_SECONDS = 60.0
 
 @dataclass(frozen=True, slots=True)
 class MadeFile:
-    """One file of a made map, on disk."""
+    """One file of a made map, on disk. place: the level and name of the part that it is of, in a map of several."""
 
     name: str
     size: int
     sha256: str
     media_type: str
     path: Path
+    place: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +57,15 @@ class Made:
 
 @dataclass(frozen=True, slots=True)
 class Product:
-    """What a maker returns: content by name with media types, an archive of it where there are several, the report."""
+    """What a maker returns: content by name with media types, an archive of it where there are several, the report.
 
-    files: dict[str, tuple[bytes, str]]
+    A path instead of bytes is a file on the cache's disk, which is linked. places: see ``MadeFile.place``.
+    """
+
+    files: dict[str, tuple[bytes | Path, str]]
     archive: tuple[str, bytes] | None
     report: dict[str, Any]
+    places: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
 
 ABANDONED_SECONDS = 3600.0
@@ -109,11 +114,36 @@ class Cache:
             self.misses += 1
             return replace(self._store(key, maker()), fresh=True)
 
+    @contextlib.contextmanager
+    def holding(self) -> Iterator[Callable[[Made], Made]]:
+        """A function that keeps a made map's files until the block ends, whatever room the cache needs meanwhile.
+
+        It raises FileNotFoundError where they are gone already.
+        """
+        folder = self._folder / f"making-{uuid4().hex}"
+        folder.mkdir()
+        count = 0
+
+        def hold(made: Made) -> Made:
+            nonlocal count
+            files = []
+            for file in made.files:
+                count += 1
+                _link(file.path, folder / str(count))
+                files.append(replace(file, path=folder / str(count)))
+            return replace(made, files=tuple(files), archive=None)
+
+        try:
+            yield hold
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
     def _store(self, key: str, product: Product) -> Made:
         making = self._folder / f"making-{uuid4().hex}"
         making.mkdir()
         try:
             files = [_write(making, str(k), name, *content) for k, (name, content) in enumerate(product.files.items())]
+            files = [{**f, "place": product.places[f["name"]]} if f["name"] in product.places else f for f in files]
             archive = _write(making, "whole", *product.archive, "application/zip") if product.archive else None
             described = {"files": files, "archive": archive, "report": product.report}
             (making / "map.json").write_bytes(orjson.dumps(described))
@@ -204,11 +234,30 @@ class Cache:
         return self._folder / key[:2] / key
 
 
-def _write(folder: Path, stored: str, name: str, data: bytes, media_type: str) -> dict[str, Any]:
-    (folder / stored).write_bytes(data)
-    digest = hashlib.sha256(data).hexdigest()
-    return {"name": name, "stored": stored, "size": len(data), "sha256": digest, "media_type": media_type}
+def _write(folder: Path, stored: str, name: str, data: bytes | Path, media_type: str) -> dict[str, Any]:
+    target = folder / stored
+    if isinstance(data, Path):
+        _link(data, target)
+        with target.open("rb") as stream:
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    else:
+        target.write_bytes(data)
+        digest = hashlib.sha256(data).hexdigest()
+    size = target.stat().st_size
+    return {"name": name, "stored": stored, "size": size, "sha256": digest, "media_type": media_type}
+
+
+def _link(source: Path, target: Path) -> None:
+    """A second name of a file, or a copy where the file system has no such thing. FileNotFoundError as usual."""
+    try:
+        target.hardlink_to(source)
+    except FileNotFoundError:
+        raise
+    except OSError:
+        shutil.copyfile(source, target)
 
 
 def _described(folder: Path, f: dict[str, Any]) -> MadeFile:
-    return MadeFile(f["name"], f["size"], f["sha256"], f["media_type"], folder / f["stored"])
+    level, name = f.get("place") or (None, None)
+    place = None if level is None or name is None else (level, name)
+    return MadeFile(f["name"], f["size"], f["sha256"], f["media_type"], folder / f["stored"], place)

@@ -7,7 +7,7 @@ are taken out of the network that a format is about to write, stored or derived.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -34,6 +34,7 @@ PART_NAME = "closures in force"
 KEEPOUT = "keepout"
 BLOCKED, UNTIL = "blocked", "blocked_until"
 MAX_CELLS = 2**28
+NO_EFFECT = "none"
 MAX_LISTED = 100
 """Maximum number of edges that a report lists for one closure."""
 
@@ -133,6 +134,19 @@ def close(
     return replace(layers, parts=parts), report
 
 
+def merged_lines(reports: Iterable[Iterable[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """Join the lines of several maps' reports: one line for each closure, with all its effects and edges."""
+    out: dict[str, dict[str, Any]] = {}
+    for line in (line for report in reports for line in report):
+        known = out.setdefault(line["id"], {**line})
+        effects = dict.fromkeys([known["effect"], line["effect"]])
+        known["effect"] = ", ".join(e for e in effects if e != NO_EFFECT) or NO_EFFECT
+        known["edges"] = list(dict.fromkeys([*known["edges"], *line["edges"]]))[:MAX_LISTED]
+        if known["effect"] != NO_EFFECT:
+            known.pop("why", None)
+    return list(out.values())
+
+
 def _line(closure: Closure, effect: Mapping[str, Any], *, mark: bool) -> dict[str, Any]:
     """A report's line about one closure."""
     edges: Sequence[str] = effect.get("edges", ())
@@ -142,7 +156,7 @@ def _line(closure: Closure, effect: Mapping[str, Any], *, mark: bool) -> dict[st
     line: dict[str, Any] = {"id": closure.id, "level": closure.level, "expires": closure.expires}
     if closure.edge is not None:
         line["edge"] = closure.edge
-    line |= {"effect": ", ".join(did) or "none", "edges": list(edges[:MAX_LISTED])}
+    line |= {"effect": ", ".join(did) or NO_EFFECT, "edges": list(edges[:MAX_LISTED])}
     if not did:
         line["why"] = "this map has no such edge" if closure.edge is not None else "this map has nothing in that area"
     return line

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mimetypes
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,10 @@ from typing import Any
 from app import derive, formats
 from app.convert import closures as closing
 from app.convert import recipe as recipes
-from app.convert.recipe import Chain, Hindrance
+from app.convert import site
+from app.convert.recipe import Chain, Hindrance, Spread
 from app.derive import Step
-from app.errors import CannotDerive, FleetMapError, MissingLayer, Problem
+from app.errors import CannotConvert, CannotDerive, FleetMapError, MissingLayer, Problem
 from app.formats import Format, Inner, WriteContext, _archive
 from app.model.closures import Closures
 from app.model.features import Features
@@ -28,10 +29,12 @@ from app.templates import DEFAULT, resolve
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """A map: its files, main file first, and the report on it."""
+    """A map: its files, main file first, and the report on it. places: of the files of a map of several parts, the
+    level and the name of the part that each is of."""
 
     files: dict[str, bytes]
     report: dict[str, Any]
+    places: dict[str, tuple[str, str]] = field(default_factory=dict)
 
 
 @lru_cache(maxsize=4)
@@ -41,14 +44,21 @@ def open_store(database_url: str, blob_dir: str) -> Store:
 
 
 def make(
-    database_url: str, blob_dir: str, version: Version, name: str, values: Mapping[str, Any], way: Chain
+    database_url: str,
+    blob_dir: str,
+    version: Version,
+    name: str,
+    values: Mapping[str, Any],
+    way: Chain,
+    spread: Spread | None = None,
 ) -> Written:
     """In a worker: a stored version's map. The parts are addressed by content, so no later change can mix in."""
     store = open_store(database_url, blob_dir)
     known = formats.get_format(name)
     layers = closing.load(store, version, way.keys)
     entries = {e.key: e for e in version.parts}
-    return write(known, layers, values, way, entries, templates=version.templates, closures=version.closures)
+    templates, closures = version.templates, version.closures
+    return write(known, layers, values, way, entries, templates=templates, closures=closures, spread=spread)
 
 
 def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) -> Hindrance | None:
@@ -85,13 +95,78 @@ def write(
     credit: Mapping[PartKey, Sequence[str]] | None = None,
     templates: Templates = NO_TEMPLATES,
     closures: Closures | None = None,
+    spread: Spread | None = None,
 ) -> Written:
     """Derive and write. ``entries`` (of a stored version) or ``origin`` and ``credit`` (of files) say where each part
     came from, and under which licences and credits. templates: for the maps that a format holds. closures: to apply.
+    spread: write every part that is derived.
     """
     notes = derive.Notes()
-    made = derive.run(way.steps, layers, notes)
-    context = WriteContext(options=recipes.own_options(known, values))
+    options = recipes.own_options(known, values)
+    source = _Source(layers, way, entries, origin, credit, templates, closures)
+    if spread is None:
+        return _written(known, derive.run(way.steps, layers, notes), options, source, notes)
+    try:
+        made = derive.run(way.steps, layers, notes)
+    except CannotDerive as error:
+        if not spread.optional:
+            raise
+        if isinstance(error.__cause__, MissingLayer):
+            return Written({}, empty_report(known))
+        raise CannotConvert(error.detail, error.problems) from error
+    return _written_each(known, made, options, source, notes, spread)
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """What a map is made from, as ``write`` is given it."""
+
+    layers: Layers
+    way: Chain
+    entries: Mapping[PartKey, PartEntry] | None
+    origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None
+    credit: Mapping[PartKey, Sequence[str]] | None
+    templates: Templates
+    closures: Closures | None
+
+
+def _written_each(
+    known: Format, made: Layers, options: Any, source: _Source, notes: derive.Notes, spread: Spread
+) -> Written:
+    """One map of every part that was derived, each written as it would be by itself."""
+    parts = known.parts
+    if parts is None:
+        raise AssertionError(f"{known.name} declares no parts")
+    keys = [k for k in made.of(parts.layer) if k not in source.layers.parts and (k.level, k.name) not in spread.stored]
+    keys = [k for k in keys if not spread.names or k.name in spread.names]
+    files: dict[str, bytes] = {}
+    places: dict[str, tuple[str, str]] = {}
+    reports: list[tuple[str, Mapping[str, Any]]] = []
+    for key in sorted(keys, key=lambda k: (k.level != spread.default, k)):
+        names = [k.name for k in keys if k.level == key.level]
+        usual = not spread.names and key.name == site.default_name(parts, names)
+        chosen = replace(options, **{parts.level: key.level, parts.name: None if usual else key.name})
+        one = _written(known, made, chosen, source, notes)
+        folder = "" if key.level == spread.default else site.folder_of(key.level) + "/"
+        reports.append((folder, one.report))
+        for name, data in one.files.items():
+            files.setdefault(folder + name, data)
+            places.setdefault(folder + name, (key.level, key.name))
+    return Written(files, site.merged_report(reports) if reports else empty_report(known), places)
+
+
+def empty_report(known: Format) -> dict[str, Any]:
+    """Build the report of a map without files."""
+    members = ("layers", "attribution", "template", "dropped", "warnings", "closures")
+    empty: dict[str, Any] = {member: [] for member in members}
+    return {"format": known.name, **empty}
+
+
+def _written(known: Format, made: Layers, options: Any, source: _Source, notes: derive.Notes) -> Written:
+    """One map of what was derived and what was there."""
+    layers, way, entries, origin = source.layers, source.way, source.entries, source.origin
+    credit, templates, closures = source.credit, source.templates, source.closures
+    context = WriteContext(options=options)
     inner: list[dict[str, Any]] = []
     if known.holds:
         context.make = partial(_inner, entries, origin, credit, templates, closures, inner)
@@ -235,9 +310,9 @@ def _told(
             line["attribution"] = list(noted.get(key, ()))
         out.append(line)
     if used.datum is not None and not any(line["layer"] == "location" for line in out):
-        site = {"layer": "location", "level": GROUND, "name": "datum"}
-        site["information"] = datum_information(used.datum, entries.values())
-        out.insert(0, {**site, "steps": [], "sources": [], "attribution": []})
+        line = {"layer": "location", "level": GROUND, "name": "datum"}
+        line["information"] = datum_information(used.datum, entries.values())
+        out.insert(0, {**line, "steps": [], "sources": [], "attribution": []})
     return out
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,15 +17,19 @@ from app.convert import closures as closing
 from app.convert import files as direct
 from app.convert import make as making
 from app.convert import recipe as recipes
-from app.convert.cache import Cache, Made, Product
+from app.convert import site
+from app.convert.cache import Cache, Made, MadeFile, Product
 from app.convert.recipe import Hindrance, Recipe
 from app.errors import (
     Ambiguous,
     CannotConvert,
     CannotDerive,
     FleetMapError,
+    Invalid,
     MissingLayer,
+    NotFound,
     Problem,
+    Unavailable,
     UnreadableFile,
 )
 from app.formats import Limits, _shell, environment
@@ -35,6 +42,12 @@ from app.store.values import Version
 Run = Callable[..., Any]
 """``run(function, *args, stop=…)``: call a module-level function somewhere safe, return its result (``Pool.run``)."""
 
+
+HOLD_ATTEMPTS = 5
+"""How often a map that left the cache at once is made again, before there is no room for it."""
+
+FAILURE_SECONDS = 60.0
+"""How long an optional map that could not be made is not tried again."""
 
 TRIED = 1000
 """Of how many derivations it is remembered whether they work on some content."""
@@ -49,6 +62,7 @@ class Maps:
         self._store, self._run, self._limits = store, run, limits
         self.cache = Cache(cache_dir, cache_bytes)
         self._tried: dict[Any, Hindrance | None] = {}
+        self._failures: OrderedDict[str, tuple[float, FleetMapError]] = OrderedDict()
         self._guard = threading.Lock()
 
     def recipe(
@@ -59,30 +73,63 @@ class Maps:
         *,
         derive: bool = True,
         file: str | None = None,
+        listed: bool = False,
     ) -> Recipe:
         """How the map would be made; cheap. Raises NotFound, Invalid, MissingLayer, MissingDatum, Ambiguous.
 
         values: what the request says; the environment's templates say the rest. file: the one file of the map that is
-        wanted; its name may say more (``keepout.yaml`` is the grid keepout).
+        wanted; its name may say more (``keepout.yaml`` is the grid keepout, ``L2/map.yaml`` the one of the level L2).
+        listed: as in a manifest: files are named as those of the whole site, and no zip of them is made.
         """
         version = closing.with_areas(version)
         known = formats.get_format(name)
-        said = {**(known.by_file(file) if file else {}), **(values or {})}
+        values = values or {}
         filled = templates.resolve(version.templates, known)
-        asked = {**filled.values, **said}
-        origin = {**filled.origin, **dict.fromkeys(said, templates.REQUEST)}
+
+        def plan(without: frozenset[str]) -> Recipe:
+            if known.parts is not None:
+                selectors = (known.parts.level, known.parts.name)
+                free = {n: v for n, v in filled.values.items() if n not in selectors}  # else they hide parts
+                if file is not None:
+                    asked = {**free, **values}
+                    found = site.file_recipe(version, known, asked, file, derived=derive, without=without)
+                    if found is not None:
+                        return found
+                elif listed or site.asks_for_all(known, values):
+                    asked = {**filled.values, **values}
+                    return site.recipe(version, known, asked, derived=derive, without=without, archive=not listed)
+            hints = known.by_file(file) if file is not None else {}
+            asked = {**filled.values, **hints, **site.one_of(known, values)}
+            return recipes.recipe(version, name, asked, derived=derive, without=without)
+
+        hints = known.by_file(file) if file is not None else {}
+        origin = {**filled.origin, **dict.fromkeys({**hints, **values}, templates.REQUEST)}
+        return self._planned(version, plan, origin)
+
+    def _planned(self, version: Version, plan: Callable[[frozenset[str]], Recipe], origin: Mapping[str, str]) -> Recipe:
+        """The cheapest recipe whose derivations are not known to fail. plan: a recipe without these derivations."""
         without: frozenset[str] = frozenset()
         failed: list[Hindrance] = []
         while True:
             try:
-                found = recipes.recipe(version, name, asked, derived=derive, without=without)
+                found = plan(without)
             except MissingLayer as error:
                 raise recipes.exhausted(error, failed) from error
-            tried = self._tried.get(_content(version, found.chain)) if found.steps else None
-            if tried is None or not tried.step:
-                return replace(found, origin=origin)
+            tried = self._hindered(version, found)
+            if tried is None:
+                return _with_origin(found, origin)
             without |= {tried.step}
             failed.append(tried)
+
+    def _hindered(self, version: Version, recipe: Recipe) -> Hindrance | None:
+        """The step that is known to fail on this content. A map that may be empty is planned all the same."""
+        for one in [recipe, *(member.recipe for member in recipe.members)]:
+            if one.members or not one.steps or (one.spread is not None and one.spread.optional):
+                continue
+            tried = self._tried.get(_content(version, one.chain))
+            if tried is not None and tried.step:
+                return tried
+        return None
 
     def ready(self, recipe: Recipe) -> Made | None:
         """The map, only if it is made already."""
@@ -94,10 +141,62 @@ class Maps:
         CannotDerive where a step finds nothing to use: then ``recipe`` gives another way, if there is one.
         """
         try:
+            if recipe.members:
+                return self.ready(recipe) or self._put_together(recipe, stop)
             return self.cache.get_or_make(recipe.key, lambda: self._made(recipe, stop))
         except CannotDerive as error:
-            self._remember(_content(recipe.version, recipe.chain), Hindrance(error.step, error.detail, error.choose))
+            if not recipe.members:  # else it is the member's
+                found = Hindrance(error.step, error.detail, error.choose)
+                self._remember(_content(recipe.version, recipe.chain), found)
             raise
+        except (CannotConvert, NotFound, Invalid) as error:
+            self._note_failure(recipe.key, error)
+            raise
+
+    def failure(self, recipe: Recipe) -> FleetMapError | None:
+        """Why the map could not be made a moment ago, where it was tried: content and parameters are to blame."""
+        with self._guard:
+            since, error = self._failures.get(recipe.key, (0.0, None))
+        return error if time.monotonic() - since < FAILURE_SECONDS else None
+
+    def _note_failure(self, key: str, error: FleetMapError) -> None:
+        with self._guard:
+            self._failures[key] = (time.monotonic(), error)
+            self._failures.move_to_end(key)
+            while len(self._failures) > TRIED:
+                self._failures.popitem(last=False)
+
+    def _put_together(self, recipe: Recipe, stop: Stop | None) -> Made:
+        """A map of several: each is made by itself. Those that are there already stay while the others are made."""
+        with self.cache.holding() as hold:
+            held = [self._held(member.recipe, hold, stop) for member in recipe.members]
+            return self.cache.get_or_make(recipe.key, lambda: joined(recipe, held))
+
+    def _held(self, recipe: Recipe, hold: Callable[[Made], Made], stop: Stop | None) -> Made:
+        for _ in range(HOLD_ATTEMPTS):
+            with contextlib.suppress(FileNotFoundError):  # the cache needed the room in this very moment
+                return hold(self.make(recipe, stop))
+        raise Unavailable("the cache of maps is too small for what is made at once: try again, or enlarge it")
+
+    def fetch(
+        self,
+        version: Version,
+        name: str,
+        values: Mapping[str, str] | None = None,
+        *,
+        derive: bool = True,
+        file: str | None = None,
+    ) -> MadeFile:
+        """The map's wanted file, or the zip of all; blocks until it is made.
+
+        Raises what ``recipe`` and ``make`` do; NotFound where the map has no such file.
+        """
+        while True:
+            recipe = self.recipe(version, name, values, derive=derive, file=file)
+            try:
+                return file_of(recipe, self.ready(recipe) or self.make(recipe), file)
+            except CannotDerive:
+                continue  # it is remembered: the next recipe goes another way, or says that there is none
 
     def at_once(
         self,
@@ -118,6 +217,10 @@ class Maps:
 
     def report(self, recipe: Recipe) -> dict[str, Any]:
         """What was raw, derived, filled in and dropped: the contract's report, for this version."""
+        if recipe.members:
+            clashes = {**making.empty_report(recipe.format), "dropped": self.make(recipe).report["dropped"]}
+            members = [(member.folder, self.report(member.recipe)) for member in recipe.members]
+            return site.merged_report([*members, ("", clashes)])
         told = self.make(recipe).report
         entries = {(e.key.layer, e.key.level, e.key.name): e.provenance for e in recipe.version.parts}
         anew = {step.gives for step in recipe.steps}
@@ -288,15 +391,79 @@ class Maps:
         wanted = {} if stop is None else {"stop": stop}
         try:
             written: making.Written = self._run(
-                making.make, *where, recipe.version, recipe.format.name, values, recipe.chain, **wanted
+                making.make, *where, recipe.version, recipe.format.name, values, recipe.chain, recipe.spread, **wanted
             )
         except WorkerDied as error:
             raise CannotConvert(f"{recipe.format.name} could not be made: {error.detail}") from error
-        typed = {name: (data, making.media_type(recipe.format, name)) for name, data in written.files.items()}
+        typed: dict[str, tuple[bytes | Path, str]] = {
+            name: (data, making.media_type(recipe.format, name)) for name, data in written.files.items()
+        }
         archive = None
-        if len(typed) > 1:
+        if len(typed) > 1 and recipe.spread is None:
             archive = (f"{recipe.format.name}.zip", making.zipped(written.files))
-        return Product(typed, archive, written.report)
+        return Product(typed, archive, written.report, written.places)
+
+
+def file_of(recipe: Recipe, made: Made, file: str | None) -> MadeFile:
+    """The wanted file of a made map, or the zip of all. file: as the request names it. NotFound where it has none."""
+    if file is None:
+        return made.whole()
+    wanted = recipe.file or file
+    found = made.file(wanted)
+    if found is None and recipe.spread is not None and "/" not in wanted:
+        others = [f for f in made.files if f.name.rpartition("/")[2] == wanted]
+        found = others[0] if len(others) == 1 else None  # on the only level that has it
+    if found is None:
+        names = ", ".join(f.name for f in made.files[:20]) or "none"
+        raise NotFound(f"this map has no file {file!r}; its files are: {names}")
+    return found
+
+
+def joined(recipe: Recipe, held: Sequence[Made]) -> Product:
+    """The files of all members, each at its place; of two of one name the first stays, and the report says so."""
+    files: dict[str, tuple[bytes | Path, str]] = {}
+    places: dict[str, tuple[str, str]] = {}
+    clashes: list[dict[str, Any]] = []
+    for member, made in zip(recipe.members, held, strict=True):
+        for file in site.select(made.files, member):
+            name = member.folder + file.name
+            place = file.place or member.place
+            if name in files:
+                why = f"a file of {places[name][1]!r} has the same name: rename one of the two"
+                clashes.append({"what": f"file {name} of {place[1] if place else name!r}", "count": 1, "why": why})
+                continue
+            files[name] = (file.path, file.media_type)
+            if place is not None:
+                places[name] = place
+    if not files:
+        raise site.nothing_made(recipe)
+    archive = None
+    if recipe.archive and len(files) > 1:
+        archive = (f"{recipe.format.name}.zip", making.zipped(_Contents({n: p for n, (p, _) in files.items()})))
+    report = site.merged_report([(m.folder, made.report) for m, made in zip(recipe.members, held, strict=True)])
+    return Product(files, archive, {**report, "dropped": [*report["dropped"], *clashes]}, places)
+
+
+class _Contents(Mapping[str, bytes]):
+    """Files by name, read when they are needed."""
+
+    def __init__(self, paths: Mapping[str, bytes | Path]) -> None:
+        self._paths = paths
+
+    def __getitem__(self, name: str) -> bytes:
+        found = self._paths[name]
+        return found if isinstance(found, bytes) else found.read_bytes()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._paths)
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+
+def _with_origin(recipe: Recipe, origin: Mapping[str, str]) -> Recipe:
+    members = tuple(replace(member, recipe=replace(member.recipe, origin=origin)) for member in recipe.members)
+    return replace(recipe, origin=origin, members=members)
 
 
 def _content(version: Version, way: recipes.Chain) -> Any:

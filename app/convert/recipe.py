@@ -72,10 +72,27 @@ class Chain:
 
 
 @dataclass(frozen=True, slots=True)
+class Spread:
+    """How a chain's last layer becomes one map of all its parts, for formats whose files hold one part each.
+
+    default: the level whose files are at the top. names: of the parts to write, empty for all. stored: (level, name)
+    of parts that are stored, and are not written here. optional: where the layers have nothing of the kind, the map
+    has no files.
+    """
+
+    default: str
+    names: tuple[str, ...] = ()
+    stored: tuple[tuple[str, str], ...] = ()
+    optional: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Recipe:
     """One map of one version: everything ``make`` needs to know, and the key of what it will give.
 
     origin: where the parameters that are no defaults came from (request, environment, a set); it is no part of the key.
+    spread: every part that the chain gives, instead of one. members: the maps that this one is put together from.
+    archive: whether a zip of those is wanted. file: the wanted file's name in the map, where one is wanted.
     """
 
     version: Version
@@ -84,6 +101,10 @@ class Recipe:
     chain: Chain
     key: str
     origin: Mapping[str, str] = field(default_factory=dict)
+    spread: Spread | None = None
+    members: tuple[Member, ...] = ()
+    archive: bool = False
+    file: str | None = None
 
     @property
     def etag(self) -> str:
@@ -94,6 +115,22 @@ class Recipe:
     def steps(self) -> tuple[Step, ...]:
         """The derivations on the way, in order."""
         return self.chain.steps
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A map that is a part of a larger one. folder: where its files go, with its slash.
+
+    place: the level and name of the part that it is of; None where it is of several, of which these levels and names
+    (None: all) are used. only_default: on each level only the part that is written where none is named.
+    """
+
+    recipe: Recipe
+    folder: str = ""
+    place: tuple[str, str] | None = None
+    levels: frozenset[str] | None = None
+    names: frozenset[str] | None = None
+    only_default: bool = False
 
 
 def stock(version: Version) -> Stock:
@@ -192,13 +229,17 @@ def _named(
     known: Format, available: Stock, options: Any, asked: Mapping[str, str], without: frozenset[str]
 ) -> Chain | None:
     """The way to a part that is asked for by name and not stored, where a derivation makes parts of that name."""
-    wish = known.named(options)
-    if wish is None or any((k.layer, k.name) == wish for k in available.keys):
+    parts = known.parts
+    if parts is None or (name := getattr(options, parts.name)) is None:
         return None
-    layer, name = wish
+    layer, level = parts.layer, getattr(options, parts.level)
+    if any((k.layer, k.name) == (layer, name) and level in (None, k.level) for k in available.keys):
+        return None
     further = asked.keys() - {f.name for f in dataclasses.fields(known.write_options)}
     for d in sorted(derive.all_derivations().values(), key=lambda d: (d.cost, d.name)):
         if d.gives != layer or name not in d.makes or not d.needs <= available.layers or d.name in without:
+            continue
+        if level is not None and not any(k.level == level and k.layer in d.needs for k in available.keys):
             continue
         if further <= derive.takes(d.name):
             keys = sorted(k for k in available.keys if k.layer in d.needs or (k.layer, k.name) == (layer, MAP))
@@ -311,8 +352,13 @@ def recipe(
     known = formats.get_format(name)
     options = own_options(known, values)
     way = chain(known, stock(version), options, derived=derived, values=values, without=without)
+    return of_chain(version, known, options, way)
+
+
+def of_chain(version: Version, known: Format, options: Any, way: Chain, spread: Spread | None = None) -> Recipe:
+    """The recipe of a map by this chain. spread: see ``Recipe``."""
     entries = {e.key: e for e in version.parts}
-    return Recipe(version, known, options, way, _key(version, known, options, way, entries))
+    return Recipe(version, known, options, way, _key(version, known, options, way, entries, spread), spread=spread)
 
 
 def own_options(known: Format, values: Mapping[str, str]) -> Any:
@@ -327,7 +373,14 @@ def defaults(said: Templates, known: Format) -> Any:
     return formats.write_options(known, templates.resolve(said, known).values)
 
 
-def _key(version: Version, known: Format, options: Any, way: Chain, entries: Mapping[PartKey, PartEntry]) -> str:
+def _key(
+    version: Version,
+    known: Format,
+    options: Any,
+    way: Chain,
+    entries: Mapping[PartKey, PartEntry],
+    spread: Spread | None,
+) -> str:
     ingredients: dict[str, Any] = {
         "server": __version__,
         "format": [known.name, known.version],
@@ -339,6 +392,8 @@ def _key(version: Version, known: Format, options: Any, way: Chain, entries: Map
         "levels": [[level.name, level.elevation] for level in version.levels],
     }
     ingredients |= closing.ingredients(version, known, way.keys)
+    if spread is not None:
+        ingredients["spread"] = dataclasses.asdict(spread)
     if known.holds:  # its bytes are those of other writers and, where they lack a layer, of derivations
         ingredients["formats"] = [[f.name, f.version] for f in formats.all_formats().values()]
         ingredients["derivations"] = [[d.name, d.version] for d in derive.all_derivations().values()]

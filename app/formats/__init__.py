@@ -27,7 +27,7 @@ from app.errors import BadUpload, FleetMapError, Invalid, NotFound, Problem, Too
 from app.model.features import Features
 from app.model.frame import GROUND, Anchor
 from app.model.geodesy import LocalFrame
-from app.model.layers import Layer, Layers, PartKey
+from app.model.layers import MAP, Layer, Layers, PartKey
 
 Files = Mapping[str, bytes]
 """A map as named files: relative path with forward slashes -> content."""
@@ -158,6 +158,22 @@ class NoOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class Parts:
+    """For formats whose files hold one part of a layer each: the write options that select the part.
+
+    name: the option with the part's name. stem: a part's name -> that of its files, without the ending. level: the
+    option with its level. default: the name of the part that is written where no name is given. So ``*`` for either
+    option gives every part (``app.convert.site``).
+    """
+
+    layer: Layer
+    name: str
+    stem: Callable[[str], str]
+    level: str = "level"
+    default: str = MAP
+
+
+@dataclass(frozen=True, slots=True)
 class Format:
     """A file format. Only what is declared here is known of it elsewhere.
 
@@ -175,9 +191,9 @@ class Format:
     yields: a main file of this name only speaks for others (a world file for its picture), so it is none where one of
     those is a main file itself. lacking: what a file needs that may be such a map but does not say enough by itself (a
     picture without a place); empty for other files. completing: the read options that say it.
-    looks_at: files of other maps of the upload that it looks into. named: the part (layer, name) that these options
-    ask for by name, if they do. holds: it is a folder of other formats' maps. marks_blocked: who reads it knows a word
-    for an edge that nobody may use, so that such an edge stays in it; other formats leave it out.
+    looks_at: files of other maps of the upload that it looks into. parts: the options that select a stored part, for
+    formats whose files hold one part each. holds: it is a folder of other formats' maps. marks_blocked: who reads it
+    knows a word for an edge that nobody may use, so that such an edge stays in it; other formats leave it out.
     """
 
     name: str
@@ -200,7 +216,7 @@ class Format:
     extensions: tuple[str, ...] = ()
     choose: Callable[[Sequence[PartKey], Any], Sequence[PartKey]] = lambda keys, options: keys
     by_file: Callable[[str], Mapping[str, str]] = lambda name: {}
-    named: Callable[[Any], tuple[Layer, str] | None] = lambda options: None
+    parts: Parts | None = None
     outlines: bool = False
     joined: bool = False
     sort: Callable[[Files, Sequence[str]], Mapping[str, Iterable[str]]] | None = None

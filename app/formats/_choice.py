@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from app.errors import Ambiguous, MissingLayer, NotFound
 from app.model.frame import GROUND
 from app.model.layers import MAP, Layer, PartKey
+
+
+def file_stem(name: str, usual: str = MAP) -> str:
+    """Turn a part's name into that of its files, without the ending: one folder deep, and not hidden."""
+    # A second character ":" would make a Windows drive of it, which no archive may hold.
+    return re.sub(r"[/\\\x00-\x1f]|(?<=^.):", "_", name.lstrip(".")).lstrip(".") or usual
 
 
 def the_one(

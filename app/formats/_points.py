@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import Invalid, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Limits, ReadContext, WriteContext
-from app.formats._choice import the_one
+from app.formats import Files, Limits, Parts, ReadContext, WriteContext
+from app.formats._choice import file_stem, the_one
 from app.model.frame import Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
 from app.model.layers import MAP, Layers, Part, PartKey, Resources, cloud_name
@@ -396,8 +396,8 @@ FRAME_DOC = (
     "source: coordinates as uploaded; local: metres in the local frame; default: source in the format that was "
     "uploaded, local in others"
 )
-NAME_DOC = "name of the voxel map; default: map, else the only one"
-LEVEL_DOC = "level of the voxel map; default: the one it is on"
+NAME_DOC = "name of the voxel map; *: all; default: map, else the only one"
+LEVEL_DOC = "level of the voxel map; *: all; default: the one it is on"
 
 MOST = 2**25
 """Points that voxels are made into at most."""
@@ -533,8 +533,10 @@ def centres(voxels: VoxelMap, context: WriteContext) -> Cloud:
 
 def file_name(name: str | None, ending: str) -> str:
     """``map.pcd``, or the asked for name's."""
-    stem = re.sub(r"[/\\\x00-\x1f]", "_", name or MAP).lstrip(".") or MAP
-    return f"{stem}.{ending}"
+    return f"{file_stem(name or MAP)}.{ending}"
+
+
+PARTS = Parts("voxels", "name", file_stem)
 
 
 def by_file(endings: Sequence[str]) -> Callable[[str], dict[str, str]]:

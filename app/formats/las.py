@@ -87,5 +87,6 @@ register(
         extensions=(".las", ".laz"),
         choose=choose,
         by_file=by_file,
+        parts=_points.PARTS,
     )
 )

@@ -30,6 +30,7 @@ from app.formats import (
     Format,
     Limits,
     Needs,
+    Parts,
     ReadContext,
     WriteContext,
     _image,
@@ -38,10 +39,10 @@ from app.formats import (
     _yaml,
     register,
 )
-from app.formats._choice import the_one
+from app.formats._choice import file_stem, the_one
 from app.model.frame import MAX_METRES
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, Mode, OccupancyGrid, outline
-from app.model.layers import MAP, Layer, Layers, PartKey
+from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
 
 NAME = "occupancy_grid"
@@ -83,8 +84,8 @@ class ReadOptions:
 class WriteOptions:
     """Which grid, and how it is written."""
 
-    grid: str | None = parameter(None, "name of the grid; default: map, else the only one")
-    level: str | None = parameter(None, "level of the grid; default: the one it is on")
+    grid: str | None = parameter(None, "name of the grid; *: all, drawn masks too; default: map, else the only one")
+    level: str | None = parameter(None, "level of the grid; *: all; default: the one it is on")
     file_type: Literal["pgm", "png"] | None = parameter(
         None, "picture format; default: pgm, or png where only transparency can say unknown"
     )
@@ -354,8 +355,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         grid = resampled(grid, options.resolution)
     if options.normalize:
         grid = normalized(grid)
-    # A second character ":" would make a Windows drive of it, which no archive may hold.
-    stem = re.sub(r"[/\\\x00-\x1f]|(?<=^.):", "_", key.name.lstrip(".")) or MAP
+    stem = file_stem(key.name)
     grid, pixels, kind = _encoding(grid, options, context, stem + ".yaml")
     if grid.origin[2] != 0.0:
         reason = f"the origin is turned by {grid.origin[2]:g} rad; Nav2 ignores that: ask for normalize=true"
@@ -369,11 +369,6 @@ def choose(keys: Sequence[PartKey], options: WriteOptions) -> Sequence[PartKey]:
     """The named grid; else ``map``, else the only one; on its level, else on the ground, else on the only one."""
     supply = "upload one (a YAML and its image)"
     return the_one(keys, "occupancy", options.grid, options.level, what="grid", option="grid", supply=supply)
-
-
-def named(options: WriteOptions) -> tuple[Layer, str] | None:
-    """The grid that is asked for by name."""
-    return ("occupancy", options.grid) if options.grid is not None else None
 
 
 def by_file(name: str) -> dict[str, str]:
@@ -648,7 +643,7 @@ register(
         write_options=WriteOptions,
         choose=choose,
         by_file=by_file,
-        named=named,
+        parts=Parts("occupancy", "grid", file_stem),
         check=_occupancy_grid_rules.check,
         rank=40,
         version=2,

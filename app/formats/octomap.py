@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.errors import NotFound, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _octomap_rules, register
-from app.formats._choice import the_one
+from app.formats import Files, Format, Needs, Parts, ReadContext, WriteContext, _octomap_rules, register
+from app.formats._choice import file_stem, the_one
 from app.model.frame import is_writable
 from app.model.layers import MAP, Layers, PartKey
 from app.model.voxels import DEPTH, LOG_ODDS, UNSET, VoxelMap, coarser, cut, parents_of, pruned
@@ -60,8 +60,8 @@ Rows = NDArray[np.intp]
 class WriteOptions:
     """Which voxels, and how they are written."""
 
-    name: str | None = parameter(None, "name of the voxel map; default: map, else the only one")
-    level: str | None = parameter(None, "level of the voxel map; default: the one it is on")
+    name: str | None = parameter(None, "name of the voxel map; *: all; default: map, else the only one")
+    level: str | None = parameter(None, "level of the voxel map; *: all; default: the one it is on")
     kind: Literal["bt", "ot"] | None = parameter(
         None, "bt: free and occupied only; ot: log-odds and colours; default: as uploaded"
     )
@@ -378,7 +378,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         context.warn(f"a tree of the type {tree} is served as an {OCTREE}")
         tree = OCTREE
     size, body = _binary(voxels) if kind == "bt" else _full(voxels, tree == COLOR_OCTREE)
-    stem = re.sub(r"[/\\\x00-\x1f]", "_", options.name or MAP).lstrip(".") or MAP
+    stem = file_stem(options.name or MAP)
     return {f"{stem}.{kind}": _head(kind, tree, size, voxels) + body}
 
 
@@ -536,5 +536,6 @@ register(
         extensions=(".bt", ".ot"),
         choose=choose,
         by_file=by_file,
+        parts=Parts("voxels", "name", file_stem),
     )
 )

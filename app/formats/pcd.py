@@ -71,5 +71,6 @@ register(
         extensions=(".pcd",),
         choose=choose,
         by_file=_points.by_file((NAME,)),
+        parts=_points.PARTS,
     )
 )

@@ -74,5 +74,6 @@ register(
         extensions=(".ply",),
         choose=choose,
         by_file=_points.by_file((NAME,)),
+        parts=_points.PARTS,
     )
 )

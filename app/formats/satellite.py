@@ -16,7 +16,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.errors import Invalid, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext, _image, _raster, _xml, register
-from app.formats._choice import the_one
+from app.formats import Files, Format, Limits, Needs, Parts, ReadContext, WriteContext, _image, _raster, _xml, register
+from app.formats._choice import file_stem, the_one
 from app.formats._text import DEGREES, METRES
 from app.model.frame import MAX_METRES, is_writable
 from app.model.geodesy import WGS84, crs_bounds
@@ -96,8 +96,8 @@ class ReadOptions:
 class WriteOptions:
     """Which picture, and how it is written."""
 
-    picture: str | None = parameter(None, "name of the picture; default: satellite, else the only one")
-    level: str | None = parameter(None, "level of the picture; default: the one it is on")
+    picture: str | None = parameter(None, "name of the picture; *: all; default: satellite, else the only one")
+    level: str | None = parameter(None, "level of the picture; *: all; default: the one it is on")
     file_type: Literal["tif", "png"] | None = parameter(
         None, "tif: a cloud optimized GeoTIFF with everything (default); png: 8 bit with a world file"
     )
@@ -417,7 +417,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
             picture = replace(made, properties=_without_statistics(made.properties))
     elif options.resampling is not None:
         raise Invalid("resampling only says how crs=local, crs=wgs84 or a resolution are made: ask for one of them")
-    stem = re.sub(r"[/\\\x00-\x1f]|(?<=^.):", "_", (options.picture or NAME).lstrip(".")) or NAME
+    stem = file_stem(options.picture or NAME, NAME)
     named: str | None = picture.crs
     if picture.crs == LOCAL:
         named = None
@@ -534,6 +534,7 @@ register(
         extensions=IMAGE_ENDS,
         choose=choose,
         by_file=by_file,
+        parts=Parts("imagery", "picture", partial(file_stem, usual=NAME), default=NAME),
         yields=yields,
         lacking=lacking,
         completing=frozenset({"corners", "metres_per_pixel"}),

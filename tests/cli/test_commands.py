@@ -7,6 +7,7 @@ import os
 import shlex
 import shutil
 import subprocess
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -138,6 +139,24 @@ def test_a_grid_gets_its_name_and_a_merge_deletes_nothing(fleetmap: Fleetmap, ne
     assert fleetmap("export", "merged", "tmap2", "-o", tmp_path / "all.yaml").status == 0
     text = (tmp_path / "all.yaml").read_text()
     assert all(f"name: {node}" in text for node in "ABC")
+
+
+def test_export_gives_the_whole_site(fleetmap: Fleetmap, tmp_path: Path) -> None:
+    assert fleetmap("generate", "office", "--seed", "7", "-e", "tower").status == 0
+    folder = tmp_path / "site"
+    options = ("-O", "level=*", "-O", "grid=*")
+    written = fleetmap("export", "tower", "occupancy_grid", *options, "-o", f"{folder}/", "--json").json
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert {"map.yaml", "map.pgm", "L2/map.yaml", "L2/map.pgm", "speed.yaml", "L2/speed_filter_info.yaml"} <= names
+    assert {Path(path).relative_to(folder).as_posix() for path in written["files"]} == names
+    lines = {(line["level"], line["name"]) for line in written["report"]["layers"] if line["layer"] == "occupancy"}
+    assert lines == {("ground", "map"), ("L2", "map"), ("ground", "speed"), ("L2", "speed")}
+    assert fleetmap("export", "tower", "occupancy_grid", *options, "-o", tmp_path / "site.zip").status == 0
+    with zipfile.ZipFile(tmp_path / "site.zip") as archive:
+        assert set(archive.namelist()) == names
+    one = tmp_path / "one.yaml"
+    assert fleetmap("export", "tower", "occupancy_grid", "--file", "L2/map.yaml", "-o", one).status == 0
+    assert one.read_bytes() == (folder / "L2" / "map.yaml").read_bytes()
 
 
 def test_a_dry_run_stores_nothing(fleetmap: Fleetmap, network: Path) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import pytest
 import zenoh
@@ -78,13 +79,13 @@ def test_a_map_in_the_making_keeps_nobody_waiting(
     api.post("environments", {"name": "busy"})
     api.upload("busy", {"network.tmap2.yaml": samples.tmap2()})
     go, maps, late = threading.Event(), api.app.state.services.maps, []
-    make = maps.at_once
+    make = maps.fetch
 
     def slow(*asked: Any, **more: Any) -> Any:
         assert go.wait(30)
         return make(*asked, **more)
 
-    monkeypatch.setattr(maps, "at_once", slow)
+    monkeypatch.setattr(maps, "fetch", slow)
     try:
         for _ in range(10):
             session.get("fleetmap/busy/latest/maps/geojson/map.geojson", late.append, timeout=30.0)
@@ -98,6 +99,25 @@ def test_a_map_in_the_making_keeps_nobody_waiting(
     eventually(lambda: len(late) == 10)
     assert len({bytes(reply.ok.payload) for reply in late}) == 1
     assert not [r for r in caplog.records if r.levelname == "ERROR"], "who left before the answer is no error"
+
+
+def test_whole_site_over_zenoh_is_the_bytes_of_http(api: Api, session: zenoh.Session) -> None:
+    api.post("environments", {"name": "tower"})
+    api.upload("tower", samples.grid())
+    api.upload("tower", samples.grid(width=12), grid="nav", level="a/b 2")
+    base, folder = "tower/latest/maps/occupancy_grid", "a%2Fb%202"
+    for rest, query in (
+        ("", "level=*;grid=*"),
+        (f"/{folder}/nav.pgm", ""),
+        (f"/{folder}/nav.yaml", "level=*;grid=*"),
+        ("/map.yaml", "level=*"),
+    ):
+        reply = next(iter(session.get(f"fleetmap/{base}{rest}?{query}", timeout=20.0)))
+        assert reply.ok is not None, bytes(reply.err.payload)
+        path = f"environments/tower/versions/latest/maps/occupancy_grid{quote(rest)}?{query.replace(';', '&')}"
+        assert bytes(reply.ok.payload) == api.get(path).content
+    reply = next(iter(session.get(f"fleetmap/{base}/L9/map.yaml", timeout=20.0)))
+    assert json.loads(bytes(reply.err.payload))["status"] == 404
 
 
 def test_what_is_too_large_for_zenoh_is_not_even_read(

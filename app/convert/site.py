@@ -1,0 +1,389 @@
+"""The whole site in one format: every level, every named part, and every mask that can be drawn from zones.
+
+Formats whose files hold one part each declare the options that select it (``Format.parts``). Where such an option is
+``*``, the map is put together from ordinary maps, each made and cached by its own key: one for each stored part, and
+one for each derivation that makes parts which are not stored. Files of the default level are at the top, those of
+other levels below a folder of the level's name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import orjson
+
+from app import derive
+from app.convert import closures as closing
+from app.convert import recipe as recipes
+from app.convert.recipe import Chain, Member, Recipe, Spread, Stock
+from app.derive import Derivation
+from app.errors import NotFound
+from app.formats import Format, Parts
+from app.model.frame import GROUND
+from app.model.layers import MAP, Layer, PartKey
+from app.store.values import Version
+
+EVERY = "*"
+"""The value of an option that selects all: levels, or parts by name."""
+
+SITE_WIDE: frozenset[Layer] = frozenset({"location", "resources"})
+"""Layers that are of all levels, whichever one they are stored on."""
+
+MAX_FOLDER_BYTES = 120
+DIGEST_DIGITS = 16
+
+_SAFE = re.compile(r"[A-Za-z0-9_-](?:[A-Za-z0-9_ -]*[A-Za-z0-9_-])?")
+
+
+def folder_of(level: str) -> str:
+    """Name the folder of a level's files: letters, digits, ``_``, ``-`` and inner spaces stay, all else is
+    percent-encoded, as in an address.
+
+    No folder holds a dot and every file does, so none has the name of a file. A name that becomes too long is cut,
+    and ends in ``~`` and the start of its SHA-256.
+    """
+    text = level if _SAFE.fullmatch(level) else "".join(map(_encoded, level))
+    if len(text) > MAX_FOLDER_BYTES:
+        digest = hashlib.sha256(level.encode()).hexdigest()[:DIGEST_DIGITS]
+        text = f"{text[:MAX_FOLDER_BYTES].rstrip('%')}~{digest}"
+    return text
+
+
+def _encoded(character: str) -> str:
+    if character.isascii() and (character.isalnum() or character in "_-"):
+        return character
+    return "".join(f"%{byte:02X}" for byte in character.encode())
+
+
+def level_of(folder: str, levels: Iterable[str]) -> str | None:
+    """Find the level that a folder is named after."""
+    return next((level for level in levels if folder_of(level) == folder), None)
+
+
+def asks_for_all(fmt: Format, values: Mapping[str, Any]) -> bool:
+    """Whether several parts are selected."""
+    return fmt.parts is not None and EVERY in (values.get(fmt.parts.name), values.get(fmt.parts.level))
+
+
+def everything(fmt: Format) -> dict[str, str]:
+    """Build the options that select the whole site; none where one map is of all levels anyway."""
+    return {} if fmt.parts is None else {fmt.parts.level: EVERY, fmt.parts.name: EVERY}
+
+
+def one_of(fmt: Format, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Take the options that select one part; those that are ``*`` are left to the default."""
+    selectors = () if fmt.parts is None else (fmt.parts.name, fmt.parts.level)
+    return {option: value for option, value in values.items() if option not in selectors or value != EVERY}
+
+
+@dataclass(frozen=True, slots=True)
+class _Site:
+    """What a site's map is put together from.
+
+    stored: the parts of the format's layer; empty where they are derived. main: the chain that derives them then.
+    makers: the derivations of parts that are not stored. default: the level whose files are at the top. values: what
+    was requested besides the parts; own_values: without what only the makers know.
+    """
+
+    version: Version
+    format: Format
+    parts: Parts
+    available: Stock
+    stored: tuple[PartKey, ...]
+    main: Chain | None
+    makers: tuple[Derivation, ...]
+    default: str
+    values: Mapping[str, Any]
+    own_values: Mapping[str, Any]
+
+    @property
+    def levels(self) -> frozenset[str]:
+        """All levels that a folder may be named after."""
+        keys = {entry.key.level for entry in self.version.parts}
+        return frozenset(keys | {level.name for level in self.version.levels})
+
+    def prefix(self, level: str) -> str:
+        """The folder of a level's files, with its slash."""
+        return "" if level == self.default else folder_of(level) + "/"
+
+    def maker_of(self, name: str, level: str) -> Derivation | None:
+        """The derivation that may make this part; whether it does depends on what the zones are."""
+        if any((key.level, key.name) == (level, name) for key in self.stored):
+            return None
+        for maker in self.makers:
+            if name in maker.makes and any(k.level == level and k.layer in maker.needs for k in self.available.keys):
+                return maker
+        return None
+
+
+def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: bool, without: frozenset[str]) -> _Site:
+    """Look at what is stored. values: without the options that select parts."""
+    assert fmt.parts is not None
+    available = recipes.stock(version).seen_by(fmt)
+    stored = tuple(sorted(key for key in available.keys if key.layer == fmt.parts.layer))
+    makers = tuple(
+        d
+        for d in sorted(derive.all_derivations().values(), key=lambda d: (d.cost, d.name))
+        if derived and d.makes and d.gives == fmt.parts.layer and d.needs <= available.layers
+    )
+    own = {f.name for f in dataclasses.fields(fmt.write_options)}
+    only_makers = frozenset().union(*(derive.takes(d.name) for d in makers)) - own
+    own_values = {name: value for name, value in values.items() if name not in only_makers}
+    main = None
+    if not stored or own_values.keys() - own:  # not stored, or to be derived with these parameters
+        options = recipes.own_options(fmt, own_values)
+        main = recipes.chain(fmt, available, options, derived=derived, values=own_values, without=without)
+        stored = () if main.steps else stored
+        main = main if main.steps else None
+    default = _default_level(version, stored, main)
+    return _Site(version, fmt, fmt.parts, available, stored, main, makers, default, values, own_values)
+
+
+def _default_level(version: Version, stored: Sequence[PartKey], main: Chain | None) -> str:
+    """``ground`` where the format's parts are there (too), else the lowest level that has one."""
+    levels = {key.level for key in stored}
+    if main is not None:
+        placed = {key.level for key in main.keys if key.layer not in SITE_WIDE}
+        levels = placed or {key.level for key in main.keys}
+    if not levels or GROUND in levels:
+        return GROUND
+    heights = {level.name: level.elevation for level in version.levels}
+    return min(levels, key=lambda level: (heights.get(level, 0.0), level))
+
+
+def recipe(
+    version: Version,
+    fmt: Format,
+    values: Mapping[str, Any],
+    *,
+    derived: bool,
+    without: frozenset[str],
+    archive: bool,
+) -> Recipe:
+    """Plan a map of several parts; raises what planning one part raises.
+
+    values: one of the options that select parts is ``*``. A level that is not given is the default one; a name that is
+    not given is each level's default part. archive: whether a zip of the files is wanted.
+    """
+    parts = fmt.parts
+    assert parts is not None
+    level, name = values.get(parts.level), values.get(parts.name)
+    rest = {option: value for option, value in values.items() if option not in (parts.level, parts.name)}
+    site = _site(version, fmt, rest, derived=derived, without=without)
+    levels = None if level == EVERY else frozenset({site.default if level is None else level})
+    names = None if name in (EVERY, None) else frozenset({name})
+    members: list[Member] = []
+    if site.main is None:
+        members += _stored_members(site, levels, name, derived=derived)
+    elif names is None or not any(names <= maker.makes for maker in site.makers):
+        members.append(_spread(site, site.main, levels, names, only_default=name is None))
+    if name is not None:
+        for maker in site.makers:
+            if (names is None or names & maker.makes) and _may_add(site, maker, levels):
+                members.append(_made_by(site, maker, levels, names))
+    if not members:
+        _raise_missing(site, level, name, derived=derived)
+    return _assembled(site, members, archive=archive)
+
+
+def _stored_members(site: _Site, levels: frozenset[str] | None, name: str | None, *, derived: bool) -> Iterable[Member]:
+    """One map for each stored part; on each level the default part keeps its default file name."""
+    for level in sorted({key.level for key in site.stored}, key=lambda one: (one != site.default, one)):
+        if levels is not None and level not in levels:
+            continue
+        here = [key.name for key in site.stored if key.level == level]
+        here.sort(key=lambda one: (site.parts.stem(one) != one, one))  # of two with equal file names the first is kept
+        wanted: list[str | None] = [None]
+        if name == EVERY:
+            usual = default_name(site.parts, here)
+            wanted = [None if one == usual else one for one in here]
+        elif name is not None:
+            wanted = [one for one in here if one == name]
+        for one in wanted:
+            selected = {site.parts.level: level} | ({} if one is None else {site.parts.name: one})
+            values = {**site.own_values, **selected}
+            made = recipes.recipe(site.version, site.format.name, values, derived=derived)
+            part = one or default_name(site.parts, here) or MAP
+            yield Member(made, site.prefix(level), (level, part))
+
+
+def default_name(parts: Parts, names: Sequence[str]) -> str | None:
+    """The part of a level that is written where none is named: the usual one, else the only one."""
+    if parts.default in names:
+        return parts.default
+    return names[0] if len(names) == 1 else None
+
+
+def _spread(
+    site: _Site,
+    way: Chain,
+    levels: frozenset[str] | None,
+    names: frozenset[str] | None,
+    *,
+    only_default: bool = False,
+    maker: Derivation | None = None,
+) -> Member:
+    """All that the last step of a chain gives, as one map; a member may select some of its files."""
+    makes = () if maker is None else tuple(sorted(maker.makes))
+    kept = tuple(sorted((k.level, k.name) for k in site.stored if k.name in makes))
+    spread = Spread(site.default, makes, kept, optional=maker is not None)
+    values = site.own_values if maker is None else site.values
+    known = {f.name for f in dataclasses.fields(site.format.write_options)}
+    options = recipes.own_options(site.format, {k: v for k, v in values.items() if k in known})
+    return Member(
+        recipes.of_chain(site.version, site.format, options, way, spread), "", None, levels, names, only_default
+    )
+
+
+def _way_of(site: _Site, maker: Derivation) -> Chain:
+    """The chain of a derivation that makes named parts: it may take the frame of the layer's usual part."""
+    keys = (k for k in site.available.keys if k.layer in maker.needs or (k.layer, k.name) == (maker.gives, MAP))
+    before = site.available.pinned.get(maker.gives, {}).get(maker.name, {})
+    return Chain(derive.with_values([maker.step()], {**before, **site.values}), tuple(sorted(keys)))
+
+
+def _made_by(site: _Site, maker: Derivation, levels: frozenset[str] | None, names: frozenset[str] | None) -> Member:
+    return _spread(site, _way_of(site, maker), levels, names, maker=maker)
+
+
+def _may_add(site: _Site, maker: Derivation, levels: frozenset[str] | None) -> bool:
+    """Whether a level that has what the derivation needs lacks one of the parts that it makes."""
+    known = {(key.level, key.name) for key in site.stored}
+    able = {key.level for key in site.available.keys if key.layer in maker.needs}
+    return any(
+        (levels is None or level in levels) and any((level, n) not in known for n in maker.makes) for level in able
+    )
+
+
+def _raise_missing(site: _Site, level: str | None, name: str | None, *, derived: bool) -> None:
+    """Say what there is instead, in the words of a request for one part."""
+    selected = {site.parts.level: level, site.parts.name: name}
+    values = {**site.own_values, **{k: v for k, v in selected.items() if v not in (None, EVERY)}}
+    recipes.recipe(site.version, site.format.name, values, derived=derived)
+    raise NotFound(f"{site.format.name}: nothing that is stored fits these levels and names")
+
+
+def _assembled(site: _Site, members: Sequence[Member], *, archive: bool) -> Recipe:
+    ingredients = [
+        [m.recipe.key, m.folder, m.place, _sorted(m.levels), _sorted(m.names), m.only_default] for m in members
+    ]
+    text = orjson.dumps(["site", site.format.name, archive, ingredients])
+    steps = tuple(dict.fromkeys(step for m in members for step in m.recipe.steps))
+    keys = tuple(sorted({key for m in members for key in m.recipe.chain.keys}))
+    options = members[0].recipe.options
+    key = hashlib.sha256(text).hexdigest()
+    return Recipe(site.version, site.format, options, Chain(steps, keys), key, members=tuple(members), archive=archive)
+
+
+def _sorted(values: frozenset[str] | None) -> list[str] | None:
+    return None if values is None else sorted(values)
+
+
+def file_recipe(
+    version: Version,
+    fmt: Format,
+    values: Mapping[str, Any],
+    file: str,
+    *,
+    derived: bool,
+    without: frozenset[str],
+) -> Recipe | None:
+    """Plan the one map that a file of the site is in, by the file's name; None where it is no file of the site.
+
+    values: of the request; a level or a name in them that is not ``*`` must agree with the file's. NotFound where the
+    file's folder is no level.
+    """
+    parts = fmt.parts
+    assert parts is not None
+    rest = {option: value for option, value in values.items() if option not in (parts.level, parts.name)}
+    level, name = (None if values.get(o) == EVERY else values.get(o) for o in (parts.level, parts.name))
+    folder, _, base = file.rpartition("/")
+    if not folder and level is not None:
+        return None  # as a file of that level's own map
+    site = _site(version, fmt, rest, derived=derived, without=without)
+    of_file = level_of(folder, site.levels) if folder else site.default
+    if of_file is None or (level is not None and level != of_file):
+        levels = ", ".join(sorted(site.levels))
+        raise NotFound(f"{fmt.name} has no file {file!r}: no level has this folder; there are the levels {levels}")
+    hints = dict(fmt.by_file(base))
+    if name is None and parts.name in hints:
+        name = _named_like(site, of_file, hints[parts.name])
+    maker = site.maker_of(name, of_file) if name is not None else None
+    if maker is not None:
+        if base.rpartition(".")[2] not in {end.rpartition(".")[2] for end in fmt.files}:
+            kind = {option: value for option, value in hints.items() if option != parts.name}
+            site = replace(site, values={**kind, **site.values})
+        return replace(_made_by(site, maker, None, None).recipe, file=file)
+    if site.main is not None and not hints.keys() - {parts.name}:  # as the manifest lists it, made once
+        return replace(_spread(site, site.main, None, None).recipe, file=file)
+    if not folder and not _is_at_top(site, name):
+        return None
+    selected: dict[str, Any] = {parts.level: of_file} | ({} if name is None else {parts.name: name})
+    found = recipes.recipe(
+        version, fmt.name, {**hints, **site.own_values, **selected}, derived=derived, without=without
+    )
+    return replace(found, file=base)
+
+
+def _named_like(site: _Site, level: str, stem: str) -> str:
+    """The stored part of a level whose files have this name: its own name, where it may stand in a file's."""
+    names = [key.name for key in site.stored if key.level == level]
+    if stem in names:
+        return stem
+    return next((name for name in names if site.parts.stem(name) == stem), stem)
+
+
+def _is_at_top(site: _Site, name: str | None) -> bool:
+    """Whether the default level has a part of this name (None: any)."""
+    if site.main is not None:
+        return site.default != GROUND  # else the rule for one part finds it by itself
+    return any(key.level == site.default and name in (None, key.name) for key in site.stored)
+
+
+def select(made: Iterable[Any], member: Member) -> list[Any]:
+    """The files of a member's map that belong to the site. made: with ``place``, the level and the name of the part."""
+    files = [f for f in made if member.place is not None or _fits(f.place, member)]
+    if not member.only_default:
+        return files
+    out = []
+    for level in dict.fromkeys(f.place[0] for f in files):
+        here = [f for f in files if f.place[0] == level]
+        assert member.recipe.format.parts is not None
+        usual = default_name(member.recipe.format.parts, list(dict.fromkeys(f.place[1] for f in here)))
+        out += [f for f in here if f.place[1] == usual]
+    return out
+
+
+def _fits(place: tuple[str, str] | None, member: Member) -> bool:
+    if place is None:
+        return False
+    level, name = place
+    return (member.levels is None or level in member.levels) and (member.names is None or name in member.names)
+
+
+def merged_report(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
+    """Join the reports of several maps, each with the folder of its files; what several say is said once."""
+    out: dict[str, Any] = {**reports[0][1]}
+    for member in ("layers", "attribution", "template", "dropped", "warnings"):
+        lines: list[Any] = []
+        for folder, report in reports:
+            for line in report[member]:
+                named = folder and isinstance(line, Mapping) and "file" in line
+                lines.append({**line, "file": folder + line["file"]} if named else line)
+        out[member] = _once(lines)
+    out["closures"] = closing.merged_lines([report["closures"] for _, report in reports])
+    return out
+
+
+def _once(lines: Iterable[Any]) -> list[Any]:
+    return list({orjson.dumps(line, option=orjson.OPT_SORT_KEYS): line for line in lines}.values())
+
+
+def nothing_made(recipe: Recipe) -> NotFound:
+    """The error for a site whose derivations gave no part that fits."""
+    return NotFound(f"{recipe.format.name}: no part has this level and name, and none of them can be derived")

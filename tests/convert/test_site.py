@@ -1,0 +1,108 @@
+"""Maps that are put together from the maps of several parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app import formats
+from app.convert import make, site
+from app.convert.cache import Cache, Product
+from app.convert.maps import file_of, joined
+from app.convert.recipe import Chain, Member, Recipe, Spread
+from app.errors import NotFound
+
+EMPTY = make.empty_report(formats.get_format("satellite"))
+
+
+def recipe(key: str, **more: Any) -> Recipe:
+    version: Any = None
+    known = formats.get_format("satellite")
+    return Recipe(version, known, known.write_options(), Chain((), ()), key, **more)
+
+
+def product(name: str, **more: Any) -> Product:
+    return Product({name: (name.encode(), "image/tiff")}, None, {**EMPTY, **more})
+
+
+def test_files_of_one_name_are_reported(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, 2**20)
+    members = tuple(Member(recipe(str(n)), "L2/", ("L2", name)) for n, name in enumerate(("a_b", "a/b")))
+    held = [cache.get_or_make(f"{n:064}", lambda: product("a_b.tif")) for n in range(2)]
+    out = joined(recipe("all", members=members), held)
+    assert list(out.files) == ["L2/a_b.tif"]
+    assert out.places == {"L2/a_b.tif": ("L2", "a_b")}
+    (line,) = out.report["dropped"]
+    assert "'a/b'" in line["what"]
+    assert "'a_b'" in line["why"]
+
+
+def test_reports_are_joined_with_the_folders_of_their_files() -> None:
+    lost = {"what": "zones", "count": 1, "why": "no place"}
+    warned = {"problem": "turned", "file": "map.yaml"}
+    reports = [(folder, {**EMPTY, "dropped": [lost], "warnings": [warned]}) for folder in ("", "L2/")]
+    told = site.merged_report(reports)
+    assert told["dropped"] == [lost]
+    assert [w["file"] for w in told["warnings"]] == ["map.yaml", "L2/map.yaml"]
+
+
+def test_held_files_outlive_the_cache(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, 1)
+    first = cache.get_or_make("0" * 64, lambda: product("a.tif"))
+    with cache.holding() as hold:
+        held = hold(first)
+        cache.get_or_make("1" * 64, lambda: product("b.tif"))
+        assert cache.get("0" * 64) is None
+        assert held.files[0].path.read_bytes() == b"a.tif"
+        with pytest.raises(FileNotFoundError):
+            hold(first)
+    assert not held.files[0].path.exists()
+
+
+def test_linked_files_are_stored_as_they_are(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, 2**20)
+    (file,) = cache.get_or_make("0" * 64, lambda: product("a.tif")).files
+    linked = Product({"L2/a.tif": (file.path, file.media_type)}, None, EMPTY, {"L2/a.tif": ("L2", "a")})
+    (made,) = cache.get_or_make("1" * 64, lambda: linked).files
+    assert (made.size, made.sha256, made.place) == (file.size, file.sha256, ("L2", "a"))
+    assert made.path.read_bytes() == b"a.tif"
+    (again,) = cache.get("1" * 64).files  # type: ignore[union-attr]
+    assert again == made
+
+
+def test_default_part_of_each_level_is_selected(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, 2**20)
+    files: dict[str, Any] = dict.fromkeys(("satellite.tif", "plan.tif", "L2/plan.tif"), (b"x", "image/tiff"))
+    places = {"satellite.tif": ("ground", "satellite"), "plan.tif": ("ground", "plan"), "L2/plan.tif": ("L2", "plan")}
+    made = cache.get_or_make("0" * 64, lambda: Product(files, None, EMPTY, places)).files
+    spread = recipe("0", spread=Spread("ground"))
+    assert [f.name for f in site.select(made, Member(spread, only_default=True))] == ["satellite.tif", "L2/plan.tif"]
+    assert [f.name for f in site.select(made, Member(spread, levels=frozenset({"L2"})))] == ["L2/plan.tif"]
+    assert [f.name for f in site.select(made, Member(spread, names=frozenset({"satellite"})))] == ["satellite.tif"]
+
+
+def test_file_of_a_map_of_several_parts_is_found_on_its_only_level(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, 2**20)
+    files: dict[str, Any] = dict.fromkeys(("L2/a.tif", "L2/b.tif", "b.tif"), (b"x", "image/tiff"))
+    made = cache.get_or_make("0" * 64, lambda: Product(files, None, EMPTY))
+    spread = recipe("0", spread=Spread("ground"))
+    assert file_of(spread, made, "a.tif").name == "L2/a.tif"
+    assert file_of(spread, made, "b.tif").name == "b.tif"
+    with pytest.raises(NotFound, match="its files are"):
+        file_of(spread, made, "c.tif")
+    with pytest.raises(NotFound):
+        file_of(replace(spread, spread=None), made, "a.tif")
+
+
+def test_formats_with_parts_declare_their_own_options() -> None:
+    for known in formats.all_formats().values():
+        if known.parts is not None:
+            options = known.write_options()
+            assert getattr(options, known.parts.name) is None, known.name
+            assert getattr(options, known.parts.level) is None, known.name
+            assert known.parts.layer in known.carries
+            assert site.everything(known) == {known.parts.level: "*", known.parts.name: "*"}
+    assert site.everything(formats.get_format("tmap2")) == {}
