@@ -129,7 +129,8 @@ class Position(Base):
     def refresh_areas(self) -> int:
         """Compute the areas that no commit has computed; returns how many environments were behind.
 
-        Safe beside other servers: an area is written only if the head is the one it was computed from.
+        Safe beside other servers: an area is written only if the head is the one it was computed from. An environment
+        whose content is damaged keeps the area it had.
         """
         table = tables.environment
         with self._database.read() as connection:
@@ -155,7 +156,7 @@ class Position(Base):
             try:
                 computed[environment_id] = head.number, area_of(Draft(self._chunks), head.parts, head.datum)
             except Damaged as error:
-                log.critical("area of %s: not computed, no position finds it: %s", head.environment, error.detail)
+                log.critical("area of %s: not computed, its last one stays: %s", head.environment, error.detail)
         moved: list[str] = []
         with self._database.write(tell=False) as connection:
             for environment_id in sorted(computed):
