@@ -26,7 +26,7 @@ from app.store.values import Area, Box, Environment, Match
 log = logging.getLogger(__name__)
 
 BATCH: Final = 100
-"""Environments whose areas are written in one transaction."""
+"""Environments that are read, or whose areas are written, at once."""
 
 TRIES: Final = 5
 """How often an area is computed again because the head has moved meanwhile."""
@@ -72,23 +72,21 @@ class Position(Base):
         if limit < 1:
             raise Invalid(f"limit must be at least 1, got {limit}")
         after = None if cursor is None else _rank(cursor)
-        if not self.readonly:
-            self.refresh_areas()
-        environment = tables.environment
         conditions = filters(q=q, bbox=bbox, deleted=deleted, dialect=self._database.engine.dialect.name)
-        with self._database.snapshot() as connection:
+
+        def page(connection: Connection) -> tuple[list[tuple[Environment, Match]], str | None]:
             hits = [h for h in self._hits(connection, latitude, longitude, conditions) if reaches(allowed, h.rank[3])]
             hits = sorted((h for h in hits if after is None or h.rank > after), key=lambda h: h.rank)
-            page = hits[:limit]
-            rows = {
-                row.id: row
-                for start in range(0, len(page), BATCH)
-                for row in connection.execute(
-                    select(environment).where(environment.c.id.in_([h.id for h in page[start : start + BATCH]]))
-                )
-            }
-        following = _cursor(page[-1].rank) if len(hits) > limit else None
-        return [(as_environment(rows[h.id]), h.match) for h in page], following
+            found = _environments(connection, [h.id for h in hits[:limit]])
+            following = _cursor(hits[limit - 1].rank) if len(hits) > limit else None
+            return [(found[h.id], h.match) for h in hits[:limit] if h.id in found], following
+
+        with self._database.read() as connection:
+            if self.readonly or not _stale(connection):
+                return page(connection)
+        self.refresh_areas()
+        with self._database.read() as connection:
+            return page(connection)
 
     def _hits(
         self, connection: Connection, latitude: float, longitude: float, conditions: list[ColumnElement[bool]]
@@ -132,9 +130,8 @@ class Position(Base):
         Safe beside other servers: an area is written only if the head is the one it was computed from. An environment
         whose content is damaged keeps the area it had.
         """
-        table = tables.environment
         with self._database.read() as connection:
-            stale = list(connection.execute(select(table.c.id).where(table.c.area_stale)).scalars())
+            stale = _stale(connection)
         for start in range(0, len(stale), BATCH):
             todo = stale[start : start + BATCH]
             for _ in range(TRIES):
@@ -171,6 +168,22 @@ class Position(Base):
                 put_area(connection, environment_id, area)
                 connection.execute(update(table).where(table.c.id == environment_id).values(area_stale=False))
         return moved
+
+
+def _stale(connection: Connection) -> list[str]:
+    """The ids of the environments whose areas have to be computed."""
+    table = tables.environment
+    return list(connection.execute(select(table.c.id).where(table.c.area_stale)).scalars())
+
+
+def _environments(connection: Connection, ids: list[str]) -> dict[str, Environment]:
+    """Environments by id; those that are purged meanwhile are missing."""
+    table = tables.environment
+    out: dict[str, Environment] = {}
+    for start in range(0, len(ids), BATCH):
+        rows = connection.execute(select(table).where(table.c.id.in_(ids[start : start + BATCH])))
+        out.update((row.id, as_environment(row)) for row in rows)
+    return out
 
 
 def _cursor(rank: Rank) -> str:
