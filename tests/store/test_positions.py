@@ -107,6 +107,20 @@ def test_fences_have_holes_and_several_pieces(store: Store):
     assert found.area == pytest.approx(surface(ring) + surface(island), abs=0.1)
 
 
+def test_both_databases_agree_with_geometry(store: Store):
+    random = np.random.default_rng(3)
+    drawn: dict[str, Any] = {}
+    for k in range(6):
+        outer = shapely.convex_hull(shapely.multipoints(random.random((8, 2)) * 0.1))
+        drawn[f"f{k}"] = shapely.difference(outer, outer.centroid.buffer(0.01))
+        store.create_environment(f"f{k}")
+        save(store, f"f{k}", Replace(SITE, fence(shapely.MultiPolygon(shapely.get_parts(drawn[f"f{k}"]).tolist()))))
+    vertices = shapely.get_coordinates(list(drawn.values()))[::7]
+    for x, y in (*vertices.tolist(), *(random.random((40, 2)) * 0.1).tolist()):
+        covering = {name for name, shape in drawn.items() if shape.covers(shapely.Point(x, y))}
+        assert set(names(store, y, x)) == covering, (x, y)
+
+
 @pytest.mark.parametrize("form", ["crossing", "cut", "local", "touching", "circle"])
 def test_fences_across_the_antimeridian(store: Store, form: str):
     datum = Datum(-17.0, 179.999)
