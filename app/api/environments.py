@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
@@ -25,14 +25,26 @@ from app.api.services import Here, Services
 from app.errors import Conflict, Gone, Invalid, NotFound, Problem
 from app.ingest.service import check_if_match
 from app.model.frame import Datum
-from app.store.values import Box, Environment, rfc3339
+from app.store.area import DATUM_METRES, MARGIN_METRES, NEIGHBOURHOOD_METRES
+from app.store.values import Box, Environment, Match, rfc3339
+
+CONTAINS: Final = f"""\
+`LAT,LON` in degrees: the environments that this position is in (which map am I on?).
+
+- An environment with a GNSS fence (polygons of its location layer) answers where the fence covers the position.
+- One without answers on what is mapped as floor within {NEIGHBOURHOOD_METRES:.0f} m of its datum: the rectangle around
+  a grid's free cells, the convex hull of a network, objects of kind `floor`, and {MARGIN_METRES:.0f} m around them.
+- If nothing is mapped there, it answers within {DATUM_METRES:.0f} m of its datum.
+
+A datum at exactly 0, 0 counts as none. Fences come first, then the smallest area, then the nearest datum. `match` says
+why: `by`, `area_m2`, and `distance_m` from the position to the datum."""
 
 router = APIRouter(prefix="/environments", tags=["environments"], route_class=Route)
 
 
-def as_dict(environment: Environment) -> dict[str, Any]:
-    """The environment as clients see it."""
-    return {
+def as_dict(environment: Environment, match: Match | None = None) -> dict[str, Any]:
+    """The environment as clients see it. match: why it is an answer to a position."""
+    members = {
         "name": environment.name,
         "title": environment.title,
         "description": environment.description,
@@ -45,6 +57,7 @@ def as_dict(environment: Environment) -> dict[str, Any]:
         "updated": rfc3339(environment.updated),
         "deleted": rfc3339(environment.deleted) if environment.deleted else None,
     }
+    return members if match is None else {**members, "match": match.as_dict()}
 
 
 def numbers(text: str, what: str, names: str) -> tuple[float, ...]:
@@ -67,6 +80,17 @@ def box_of(text: str, what: str = "bbox") -> Box:
             f"{what} must be west, south, east, north in degrees, with south ≤ north", [Problem("W,S,E,N", where=what)]
         )
     return west, south, east, north
+
+
+def position_of(text: str, what: str = "contains") -> tuple[float, float]:
+    """Latitude and longitude in degrees."""
+    latitude, longitude = numbers(text, what, "LAT,LON")
+    if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
+        raise Invalid(
+            f"{what} must be LAT,LON in degrees: the latitude comes first, within ±90",
+            [Problem("LAT,LON", where=what)],
+        )
+    return latitude, longitude
 
 
 def datum_of(body: DatumBody) -> Datum:
@@ -95,7 +119,8 @@ def list_environments(
     contains: Annotated[
         str | None,
         Query(
-            description="`LAT,LON`: environments around this place (which map am I on?).", examples=["53.2687,-0.5244"]
+            description=CONTAINS,
+            examples=["53.2687,-0.5244"],
         ),
     ] = None,
     bbox: Annotated[
@@ -105,23 +130,16 @@ def list_environments(
     limit: Limit = 100,
     cursor: Cursor = None,
 ) -> Response:
-    """Environments by name, those that the token reaches."""
-    place = None
-    if contains is not None:
-        latitude, longitude = numbers(contains, "contains", "LAT,LON")
-        if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
-            raise Invalid(
-                "contains must be LAT,LON in degrees: the latitude comes first", [Problem("LAT,LON", where="contains")]
-            )
-        place = (latitude, longitude)
+    """Environments by name, or the best match first with `contains`; those that the token reaches."""
+    position = None if contains is None else position_of(contains)
+    box = box_of(bbox) if bbox is not None else None
+    if position is not None:
+        hits, following = here.store.locate(
+            *position, q=q or None, bbox=box, limit=limit, cursor=cursor, allowed=who.environments, deleted=deleted
+        )
+        return page(request, [as_dict(e, match) for e, match in hits], following)
     items, following = here.store.environments(
-        q=q or None,
-        contains=place,
-        bbox=box_of(bbox) if bbox is not None else None,
-        limit=limit,
-        cursor=cursor,
-        allowed=who.environments,
-        deleted=deleted,
+        q=q or None, bbox=box, limit=limit, cursor=cursor, allowed=who.environments, deleted=deleted
     )
     return page(request, [as_dict(e) for e in items], following)
 

@@ -20,6 +20,7 @@ from starlette.responses import Response, StreamingResponse
 
 from app.api.access import Access, Principal, Viewer
 from app.api.answers import Route
+from app.api.environments import as_dict, position_of
 from app.api.maps import closure_mode, number_of
 from app.api.problems import Throttled
 from app.api.protocol import ON_STOP
@@ -29,6 +30,7 @@ from app.api.together import Together
 from app.convert.cache import MadeFile
 from app.convert.maps import file_of
 from app.errors import Invalid, NotFound, Problem, TooLarge, Unauthenticated, Unavailable
+from app.events import messages
 from app.events.bus import Answer, Make
 from app.store.values import Event
 
@@ -41,6 +43,9 @@ RECHECK_SECONDS = 5.0
 """How long a stream goes on before its token is looked up again; one revoked in this process ends it at once."""
 
 PAGE = 200
+MAX_ENVIRONMENTS = 100
+"""Environments in an answer over Zenoh."""
+
 STREAMS = 1000
 """So many streams at once for each worker."""
 
@@ -259,10 +264,12 @@ def _line(event: Event, number: int) -> bytes:
 
 def ask(here: Services, most: int, environment: str, rest: str, parameters: Mapping[str, str]) -> Answer | Make:
     """What HTTP answers at ``/environments/{environment}/versions/{rest}``: ``{v}/version``, ``{v}/maps/{format}/…``;
-    for a map that is not there, what makes it.
+    for a map that is not there, what makes it. ``server/where``: what ``/environments?contains=`` answers.
 
     most: so many bytes are answered. Blocks. Raises what the calls over HTTP answer as problems.
     """
+    if (environment, rest) == messages.POSITION_QUERY:
+        return _locate(here, parameters)
     pieces = rest.split("/")
     if pieces[1:] == ["version"]:
         version = here.store.version(environment, number_of(pieces[0]))
@@ -282,6 +289,19 @@ def ask(here: Services, most: int, environment: str, rest: str, parameters: Mapp
     if made is not None:
         return _answer_of(file_of(recipe, made, file), most)
     return lambda: _answer_of(here.maps.fetch(version, name, values, derive=derive == "true", file=file), most)
+
+
+def _locate(here: Services, parameters: Mapping[str, str]) -> Answer:
+    """The environments that a position is in, best match first, as over HTTP."""
+    given = dict(parameters)
+    latitude, longitude = given.pop("lat", None), given.pop("lon", None)
+    if given or latitude is None or longitude is None:
+        raise Invalid(
+            "a position needs lat and lon in degrees and nothing else: server/where?lat=53.2687;lon=-0.5244",
+            [Problem("lat and lon", where="parameters")],
+        )
+    hits, _ = here.store.locate(*position_of(f"{latitude},{longitude}", "lat,lon"), limit=MAX_ENVIRONMENTS)
+    return Answer(orjson.dumps([as_dict(environment, match) for environment, match in hits]), "application/json")
 
 
 def _answer_of(found: MadeFile, most: int) -> Answer:

@@ -467,6 +467,16 @@ class DatumOut(BaseModel):
     heading: float
 
 
+class MatchOut(BaseModel):
+    """Why an environment is an answer to a position."""
+
+    by: Literal["fence", "floor", "datum"] = Field(
+        description="The GNSS fence; what is mapped as floor; the neighbourhood of the datum."
+    )
+    area_m2: float = Field(description="Area of the fence, floor or neighbourhood in square metres.")
+    distance_m: float | None = Field(description="Metres from the position to the datum, null if there is none.")
+
+
 class EnvironmentOut(BaseModel):
     """An environment as it is now. ``bounds``: west, south, east, north."""
 
@@ -481,6 +491,7 @@ class EnvironmentOut(BaseModel):
     created: datetime
     updated: datetime
     deleted: datetime | None = None
+    match: MatchOut | None = Field(default=None, description="Only in the answer to `contains`.")
 
 
 class ProblemItem(BaseModel):

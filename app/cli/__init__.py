@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from app import __version__
-from app.cli import agent, align, generate, history, maps, output, serving, templates, tokens
+from app.cli import agent, align, generate, history, maps, output, position, serving, templates, tokens
 from app.cli.client import Refused
 from app.errors import FleetMapError
 
@@ -104,6 +104,8 @@ def build(*, all_flags: bool = True) -> typer.Typer:
         ("demo", serving.demo),
     ):
         app.command(name)(function)
+    # A southern latitude starts with a minus, and is no option.
+    app.command("where", context_settings={"ignore_unknown_options": True})(position.locate)
     app.add_typer(tokens.commands, name="token")
     return app
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from app.derive._choice import named, one_each
-from app.derive.occupancy_to_voxels import MASKS
 from app.errors import MissingLayer
 from app.model import masks
 from app.model.grid import OccupancyGrid
@@ -18,7 +17,7 @@ def chosen(layers: Layers, name: str | None, what: str) -> dict[PartKey, Occupan
     grids = layers.grids()
     if name is not None:
         return named(grids, name, "occupancy grid")
-    maps = {k: g for k, g in grids.items() if k.name not in MASKS and masks.NAME not in g.properties}
+    maps = {k: g for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties}
     if not maps:
         raise MissingLayer(f"costmap filter masks alone tell no {what}: upload an occupancy grid of what stands there")
     return one_each(maps, MAP, "occupancy grid", "grid")

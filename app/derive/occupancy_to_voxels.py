@@ -22,9 +22,6 @@ MOST = 2**25
 COLUMNS = 2**28
 """Columns that are looked at (``Limits.pixels``)."""
 
-MASKS = frozenset({"keepout", "speed", "nogo", "preferred"})
-"""Grids that tell where robots should go, not what stands there."""
-
 ROWS = 2**9
 """Rows that are sampled at once."""
 
@@ -54,7 +51,7 @@ def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) ->
     MissingLayer where nothing is known, CannotConvert where the octree would be too large.
     """
     parts: dict[PartKey, Part] = {}
-    found = [k for k, grid in layers.grids().items() if k.name not in MASKS and masks.NAME not in grid.properties]
+    found = [k for k, grid in layers.grids().items() if k.name not in masks.MASKS and masks.NAME not in grid.properties]
     mains = {key.level for key in found if key.name == MAP}
     for key in found:
         if key.level in mains and key.name != MAP:

@@ -290,6 +290,7 @@ class Bus:
             session.liveliness().declare_subscriber(f"{prefix}/robots/*", self._alive, history=True),
             session.declare_queryable(f"{prefix}/*/*/maps/**", self._query, complete=True),
             session.declare_queryable(f"{prefix}/*/*/version", self._query, complete=True),
+            session.declare_queryable(messages.position_key(prefix), self._query, complete=True),
         ]
 
     def _close_session(self) -> None:
@@ -344,7 +345,7 @@ class Bus:
     def _look(self, query: zenoh.Query) -> Answer | Make:
         key = str(query.key_expr)
         if "*" in key:
-            raise Invalid("ask for one map at a time: a key without wildcards")
+            raise Invalid("query one key at a time: a key without wildcards")
         environment, _, rest = key.removeprefix(self.options.prefix + "/").partition("/")
         return self._ask(environment, rest, _parameters(query))
 

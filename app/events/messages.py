@@ -49,6 +49,15 @@ def robot_key(prefix: str, robot: str) -> str:
     return f"{prefix}/robots/{robot}"
 
 
+POSITION_QUERY = ("server", "where")
+"""The pieces of the key, after the prefix, at which environments are found by position."""
+
+
+def position_key(prefix: str) -> str:
+    """Key at which the server answers which environments a position is in (``?lat=…;lon=…``)."""
+    return "/".join((prefix, *POSITION_QUERY))
+
+
 def server_key(prefix: str) -> str:
     """The server's liveliness token."""
     return f"{prefix}/server"

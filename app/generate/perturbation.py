@@ -26,7 +26,6 @@ from app.derive import Notes
 from app.derive._obstacles import body_of
 from app.derive.objects_to_occupancy import Parameters as Slice
 from app.derive.objects_to_occupancy import objects_to_occupancy
-from app.derive.occupancy_to_voxels import MASKS
 from app.errors import BadUpload, CannotConvert, CannotGenerate, Invalid, Problem
 from app.generate import MAX_CELLS, MAX_OBJECTS, Source, generates
 from app.model import masks, solids
@@ -197,7 +196,7 @@ class _Level:
         self.given, self.options, self.source, self.notes, self.level = given, options, source, notes, level
         self.parts: dict[PartKey, Features] = {k: p for k, p in given.vector("objects", level).items() if len(p)}
         grids = given.grids(level)
-        masked = {k for k, g in grids.items() if k.name in MASKS or masks.NAME in g.properties}
+        masked = {k for k, g in grids.items() if k.name in masks.MASKS or masks.NAME in g.properties}
         self.maps = {k: g for k, g in grids.items() if k not in masked}
         noisy = self.maps if options.grid is None else {k: g for k, g in grids.items() if k.name == options.grid}
         self.noisy, self.grids = frozenset(noisy), {**self.maps, **noisy}

@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from pyproj import CRS, Proj, Transformer
+from pyproj import CRS, Geod, Proj, Transformer
 from pyproj.exceptions import ProjError
 
 from app.errors import Invalid
@@ -126,6 +126,29 @@ def _transform(geometry: NDArray[np.object_], function: object) -> NDArray[np.ob
 def local_frame(datum: Datum) -> LocalFrame:
     """The frame of a datum; building one costs PROJ about a millisecond, so they are kept."""
     return LocalFrame(datum)
+
+
+@lru_cache(maxsize=1)
+def _ellipsoid() -> Geod:
+    return Geod(ellps="WGS84")
+
+
+def distance(a: tuple[float, float], b: tuple[float, float]) -> float:
+    """Metres along the ellipsoid between two (longitude, latitude) in degrees."""
+    return float(_ellipsoid().inv(*a, *b)[2])
+
+
+def surface(polygon: object) -> float:
+    """Square metres on the ellipsoid of a shapely Polygon or MultiPolygon in degrees, without its holes.
+
+    A ring whose longitudes go on beyond ±180 crosses the antimeridian.
+    """
+    total = 0.0
+    for piece in shapely.get_parts(polygon):
+        rings = [piece.exterior, *piece.interiors]
+        sizes = [abs(_ellipsoid().polygon_area_perimeter(*ring.coords.xy)[0]) for ring in rings]
+        total += sizes[0] - sum(sizes[1:])
+    return total
 
 
 def crs_bounds(crs: str, points: Array) -> tuple[float, float, float, float] | None:

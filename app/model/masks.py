@@ -21,6 +21,9 @@ NODE = "costmap_filter_info_server"
 PARAMETERS = "ros__parameters"
 KEEPOUT, SPEED_PERCENT, SPEED_METRES = 0, 1, 2
 TYPES = range(5)
+MASKS = frozenset({"keepout", "speed", "nogo", "preferred"})
+"""Names of grids that tell where robots should go, not what stands there."""
+
 DEEPEST = 4
 """Namespaces around a node that are looked into."""
 

@@ -24,6 +24,7 @@ from app.store.index import SpatialIndex
 from app.store.jobs import Jobs
 from app.store.outbox import Outbox
 from app.store.overlays import Overlays
+from app.store.position import Position
 from app.store.robots import Robots
 from app.store.tokens import Tokens
 from app.store.versions import Versions
@@ -33,7 +34,18 @@ ABANDONED_SECONDS = 24 * 3600.0
 
 
 class Store(
-    Environments, Versions, Content, SpatialIndex, Channels, Outbox, Tokens, Jobs, Robots, Overlays, Collection
+    Environments,
+    Versions,
+    Content,
+    SpatialIndex,
+    Position,
+    Channels,
+    Outbox,
+    Tokens,
+    Jobs,
+    Robots,
+    Overlays,
+    Collection,
 ):
     """One database and one blob folder. Thread-safe; cheap to open again in a worker process.
 
@@ -58,6 +70,7 @@ class Store(
         """
         schema.upgrade(self._database)
         self.blobs.prepare()
+        self.refresh_areas()
 
     def check(self) -> None:
         """Unavailable unless the database and the blob folder answer and the schema is this release's."""

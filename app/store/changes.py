@@ -11,7 +11,7 @@ from app.model.features import Features
 from app.model.frame import Datum, Level
 from app.model.layers import Part, PartKey
 from app.model.templates import Templates
-from app.store.values import PartEntry, Provenance
+from app.store.values import Area, PartEntry, Provenance
 
 __all__ = [
     "KEEP",
@@ -103,7 +103,8 @@ class Prepared:
     chunks: hash (hex) -> stored bytes of all chunks that the base does not have. blobs: SHA-256 -> content of files
     that belong to the content (resources). changes: counts by layer. changed: whether the root differs from the
     base's, or what says where the content comes from is renewed. index: the index' changes where they are few, else
-    None (it is brought up to date when it is asked).
+    None (it is brought up to date when it is asked). area: KEEP if it is the base's, None if the next query computes
+    it.
     """
 
     base: int
@@ -117,3 +118,4 @@ class Prepared:
     changed: bool
     blobs: Mapping[str, bytes] = field(default_factory=dict)
     index: tuple[IndexRows, ...] | None = None
+    area: Area | Literal[Keep.KEEP] | None = None

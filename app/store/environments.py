@@ -8,7 +8,7 @@ from datetime import datetime
 from fnmatch import fnmatchcase
 from typing import Any, Final
 
-from sqlalchemy import Connection, Row, Text, cast, delete, func, insert, or_, select, update
+from sqlalchemy import ColumnElement, Connection, Row, Text, cast, delete, func, insert, or_, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError
 
@@ -16,6 +16,7 @@ from app.errors import Conflict, Invalid
 from app.model.frame import Datum, Level
 from app.model.templates import NO_TEMPLATES, template_changes
 from app.store import outbox, tables
+from app.store.area import area_after
 from app.store.base import (
     Base,
     as_environment,
@@ -25,6 +26,7 @@ from app.store.base import (
     text,
     utcnow,
 )
+from app.store.changes import KEEP
 from app.store.index import meets
 from app.store.manifest import read_version
 from app.store.prepare import frame_changes, summarise, version_root
@@ -57,6 +59,9 @@ class Environments(Base):
         check_environment_name(name)
         empty = version_root((), None, (Level(),))
         changes = self._first_changes(datum, clone)
+        area = area_after(
+            Draft(self._chunks), (), clone.parts if clone else (), None, datum or (clone.datum if clone else None)
+        )
         now = utcnow()
         with self._database.write() as connection:
             new = secrets.token_hex(16)
@@ -75,6 +80,7 @@ class Environments(Base):
                 "sequence": sequence,
                 "datum": None,
                 "indexed": 0,
+                "area_stale": False,
                 "created": now,
                 "updated": now,
             }
@@ -94,6 +100,7 @@ class Environments(Base):
                 message="",
                 sequence=sequence,
                 indexed=0,
+                area=KEEP,
                 **frame,
             )
             events: list[dict[str, Any]] = [
@@ -116,6 +123,7 @@ class Environments(Base):
                     message=message,
                     sequence=sequence + 1,
                     indexed=1 if not first.parts else 0,
+                    area=area,
                     **frame,
                 )
                 events.append(
@@ -150,7 +158,6 @@ class Environments(Base):
         self,
         *,
         q: str | None = None,
-        contains: tuple[float, float] | None = None,
         bbox: Box | None = None,
         limit: int = 100,
         cursor: str | None = None,
@@ -159,31 +166,22 @@ class Environments(Base):
     ) -> tuple[list[Environment], str | None]:
         """A page of environments by name, and the cursor of the next page.
 
-        q: in name, title, description or a tag, whatever its case. contains: (latitude, longitude) in degrees that the
-        extent holds. bbox: (west, south, east, north) that it meets, west > east across the antimeridian. allowed: a
-        name pattern (fnmatch). deleted: those that wait for being purged instead of the others.
+        q: in name, title, description or a tag, whatever its case. bbox: (west, south, east, north) in degrees that the
+        extent meets, west > east across the antimeridian. allowed: a name pattern (fnmatch). deleted: those that wait
+        for being purged instead of the others.
         """
         if limit < 1:
             raise Invalid(f"limit must be at least 1, got {limit}")
         table = tables.environment
-        query = select(table).order_by(table.c.name)
-        query = query.where(table.c.deleted.is_not(None) if deleted else table.c.deleted.is_(None))
-        if q:
-            columns = (table.c.name, table.c.title, table.c.description)
-            found = [func.lower(c).contains(q.lower(), autoescape=True) for c in columns]
-            found.append(func.lower(cast(table.c.tags, Text)).contains(q.lower(), autoescape=True))
-            query = query.where(or_(*found))
         dialect = self._database.engine.dialect.name
-        for box in (None if contains is None else _point_box(contains), bbox):
-            if box is not None:
-                query = query.where(meets(table, table.c.extent, _checked(box), dialect))
+        query = select(table).order_by(table.c.name).where(*filters(q=q, bbox=bbox, deleted=deleted, dialect=dialect))
         out: list[Environment] = []
         after = cursor
         with self._database.read() as connection:
             while len(out) <= limit:
                 page = query if after is None else query.where(table.c.name > after)
                 rows = connection.execute(page.limit(PAGE if allowed else limit + 1)).all()
-                out += [as_environment(r) for r in rows if allowed is None or fnmatchcase(r.name, allowed)]
+                out += [as_environment(r) for r in rows if reaches(allowed, r.name)]
                 if len(rows) < (PAGE if allowed else limit + 1):
                     break
                 after = rows[-1].name
@@ -364,9 +362,23 @@ def _retire(connection: Connection, name: str, sequence: int) -> None:
     )
 
 
-def _point_box(place: tuple[float, float]) -> Box:
-    latitude, longitude = place
-    return (longitude, latitude, longitude, latitude)
+def filters(*, q: str | None, bbox: Box | None, deleted: bool, dialect: str) -> list[ColumnElement[bool]]:
+    """The conditions on an environment's row that ``environments`` describes."""
+    table = tables.environment
+    out: list[ColumnElement[bool]] = [table.c.deleted.is_not(None) if deleted else table.c.deleted.is_(None)]
+    if q:
+        columns = (table.c.name, table.c.title, table.c.description)
+        found = [func.lower(c).contains(q.lower(), autoescape=True) for c in columns]
+        found.append(func.lower(cast(table.c.tags, Text)).contains(q.lower(), autoescape=True))
+        out.append(or_(*found))
+    if bbox is not None:
+        out.append(meets(table, table.c.extent, _checked(bbox), dialect))
+    return out
+
+
+def reaches(allowed: str | None, name: str) -> bool:
+    """Whether a name pattern (None: every name) allows an environment."""
+    return allowed is None or fnmatchcase(name, allowed)
 
 
 def _checked(box: Box) -> Box:

@@ -16,6 +16,7 @@ from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import LAYERS, PART_TYPES, VECTOR_LAYERS, PartKey
 from app.model.templates import NO_TEMPLATES, Templates, template_changes
 from app.store import difference, parts, tree
+from app.store.area import area_after
 from app.store.changes import KEEP, Changes, Delete, Drop, IndexRows, Operation, Prepared, Replace
 from app.store.difference import CellChanges, FeatureChanges
 from app.store.encode import bounds, compress, from_wkb, pack, root_hash, to_wkb
@@ -53,7 +54,7 @@ def _prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
     before = {entry.key: entry for entry in base.parts}
     renewed = _renewed(before, entries, replaced)
     if root == base.root and not renewed:
-        return Prepared(base.number, root, {}, base.parts, datum, levels, templates, {}, changed=False)
+        return Prepared(base.number, root, {}, base.parts, datum, levels, templates, {}, changed=False, area=KEEP)
     what, features = summarise(draft, before, entries, replaced)
     what |= frame_changes(base.datum, datum, base.levels, levels)
     what |= template_changes(base.templates, templates)
@@ -61,10 +62,11 @@ def _prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
     index = None
     if datum == base.datum:
         index = index_rows(features, datum)
+    fresh = _fresh(draft, before, entries)
     return Prepared(
         base.number,
         root,
-        _fresh(draft, before, entries),
+        fresh,
         listed,
         datum,
         levels,
@@ -73,6 +75,7 @@ def _prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
         changed=True,
         blobs=blobs,
         index=index,
+        area=area_after(draft, base.parts, listed, base.datum, datum),
     )
 
 

@@ -26,6 +26,7 @@ from sqlalchemy import (
     String,
     Table,
     Text,
+    true,
 )
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.elements import BindParameter, ColumnElement
@@ -166,14 +167,32 @@ environment = Table(
     Column("deleted", Moment, nullable=True),
     *_box(),
     Column("extent", Place, nullable=True),
+    Column("area_stale", Boolean, nullable=False, server_default=true(), index=True),
 )
 """head and root: of the newest version. sequence: of the last event. closures_sequence: of the last event that changed
-which closures are in force. indexed: the version that ``place`` shows."""
+which closures are in force. indexed: the version that ``place`` shows. area_stale: whether ``area`` has to be computed
+from the head before it is read."""
 
 Index("ix_environment_extent", environment.c.extent, postgresql_using="gist", info=POSTGRESQL).ddl_if(
     dialect="postgresql"
 )
 Index("ix_environment_box", environment.c.south, environment.c.north, environment.c.west, environment.c.east)
+
+area = Table(
+    "area",
+    metadata,
+    _environment(primary_key=True),
+    Column("piece", Integer, primary_key=True, autoincrement=False),
+    Column("basis", String(8), nullable=False),
+    Column("size", Float(53), nullable=False),
+    *_box(),
+    Column("geometry", Place, nullable=False),
+)
+"""The heads' areas on earth, see ``app.store.area``: for "which map am I on". A piece does not cross the antimeridian.
+size: square metres of all pieces. It can be rebuilt from the trees at any time."""
+
+Index("ix_area_geometry", area.c.geometry, postgresql_using="gist", info=POSTGRESQL).ddl_if(dialect="postgresql")
+Index("ix_area_box", area.c.south, area.c.north, area.c.west, area.c.east)
 
 version = Table(
     "version",

@@ -63,6 +63,41 @@ class Environment:
     sequence: int = 0
 
 
+MatchBasis = Literal["fence", "floor", "datum"]
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """The area of an environment on earth, see ``app.store.area``.
+
+    size: square metres. pieces: (box in degrees, WKB of a valid polygon in degrees), none across the antimeridian.
+    """
+
+    by: MatchBasis
+    size: float
+    pieces: tuple[tuple[Box, bytes], ...]
+
+
+NO_AREA = Area("datum", 0.0, ())
+"""Of an environment without a place on earth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """The reason why a position is in an environment.
+
+    by: what its area is taken from. area: square metres. distance: metres to the datum, None if there is none.
+    """
+
+    by: MatchBasis
+    area: float
+    distance: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The match as clients see it."""
+        return {"by": self.by, "area_m2": self.area, "distance_m": self.distance}
+
+
 @dataclass(frozen=True, slots=True)
 class Source:
     """An uploaded file: its bytes are the blob ``sha256``. used: whether the version was made from it."""

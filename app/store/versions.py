@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
@@ -13,13 +13,14 @@ from app.errors import Conflict, Invalid, NotFound, Problem, StaleParent, Unavai
 from app.model.frame import Datum, Level
 from app.model.templates import Templates, template_changes
 from app.store import chunks, index, outbox, tables
+from app.store.area import area_after, put_area
 from app.store.base import Base, clean, clean_problem, environment_row, text, utcnow
-from app.store.changes import Changes, Prepared
+from app.store.changes import KEEP, Changes, Keep, Prepared
 from app.store.extent import extent, geometry
 from app.store.manifest import as_version, pack_manifest, read_sources, read_version
 from app.store.prepare import frame_changes, prepare, summarise
 from app.store.tree import Draft
-from app.store.values import LATEST, Idempotency, PartEntry, Source, Version
+from app.store.values import LATEST, Area, Idempotency, PartEntry, Source, Version
 
 REVERT_TRIES: Final = 8
 
@@ -61,8 +62,12 @@ def insert_version(
     time: datetime,
     sequence: int,
     indexed: int,
+    area: Area | Literal[Keep.KEEP] | None,
 ) -> None:
-    """Write a version's rows and make it the head. The caller holds the environment's row."""
+    """Write a version's rows and make it the head. The caller holds the environment's row.
+
+    area: of this version; KEEP if it is that of the version before, None if the next query computes it.
+    """
     connection.execute(
         insert(tables.version).values(
             environment_id=environment.id,
@@ -96,8 +101,11 @@ def insert_version(
             east=east,
             north=north,
             extent=geometry(box),
+            **({} if area is KEEP else {"area_stale": area is None}),
         )
     )
+    if isinstance(area, Area):
+        put_area(connection, environment.id, area)
 
 
 def insert_sources(
@@ -223,6 +231,7 @@ class Versions(Base):
                 time=now,
                 sequence=sequence,
                 indexed=number if in_step else row.indexed,
+                area=prepared.area,
             )
             _remember(connection, row.id, idempotency, number, now)
             made = read_version(connection, row, number)
@@ -287,13 +296,15 @@ class Versions(Base):
     def _reverted(self, head: Version, target: Version) -> Prepared:
         changed = head.root != target.root
         changes: dict[str, Any] = {}
+        area: Area | Literal[Keep.KEEP] | None = KEEP
         if changed:
+            area = area_after(Draft(self._chunks), head.parts, target.parts, head.datum, target.datum)
             before, after = {e.key: e for e in head.parts}, {e.key: e for e in target.parts}
             changes, _ = summarise(Draft(self._chunks), before, after)
             changes |= frame_changes(head.datum, target.datum, head.levels, target.levels)
             changes |= template_changes(head.templates, target.templates)
         kept = (target.parts, target.datum, target.levels, target.templates)
-        return Prepared(head.number, target.root, {}, *kept, changes, changed=changed)
+        return Prepared(head.number, target.root, {}, *kept, changes, changed=changed, area=area)
 
     def idempotent(self, environment: str, key: str) -> tuple[str, int] | None:
         """(fingerprint, version number) of the request that used this key, or None."""

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import io
+import json
+import math
+import re
+import zipfile
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import shapely
+from pyproj import Geod
 
 from tests.api import samples
 from tests.api.conftest import Api
@@ -154,15 +164,88 @@ def test_cloned(api: Api, farm: str, fresh: Fresh) -> None:
 def test_which_map_am_i_on(api: Api, farm: str) -> None:
     here = {"contains": "53.2687,-0.5246", "limit": "1000"}
     assert farm in [e["name"] for e in api.get("environments", params=here).json()]
+    found = next(e for e in api.get("environments", params=here).json() if e["name"] == farm)
+    assert found["match"]["by"] == "fence"
+    assert found["match"]["area_m2"] == pytest.approx(66.7 * 66.8, rel=0.01)
+    assert found["match"]["distance_m"] == pytest.approx(math.hypot(6.7, 11.1), rel=0.02)
+    assert "match" not in api.get(f"environments/{farm}").json()
+    assert all("match" not in e for e in api.get("environments", params={"bbox": "-0.6,53.2,-0.4,53.3"}).json())
     there = {"contains": "-53.2687,-0.5246"}
     assert farm not in [e["name"] for e in api.get("environments", params=there).json()]
     box = {"bbox": "-0.6,53.2,-0.4,53.3", "limit": "1000"}
     assert farm in [e["name"] for e in api.get("environments", params=box).json()]
     assert farm not in [e["name"] for e in api.get("environments", params={"bbox": "10,53.2,11,53.3"}).json()]
-    for bad in ("1", "a,b", "91,0", "0,181", "1,2,3", "nan,1", "inf,1"):
-        api.problem("GET", "environments", 422, params={"contains": bad})
+    for bad in ("1", "", "a,b", "91,0", "0,181", "1,2,3", "nan,1", "1,NaN", "inf,1"):
+        told = api.problem("GET", "environments", 422, params={"contains": bad})
+        assert "LAT,LON" in told["detail"]
+    told = api.problem("GET", "environments", 422, params={**here, "cursor": farm})
+    assert "Link header" in told["detail"]
     for bad in ("1,2,3", "0,2,1,1", "0,0,200,1"):
         api.problem("GET", "environments", 422, params={"bbox": bad})
+
+
+FIELDS = {
+    "riseholme_park_farm_general_east_pathway": "53.26868,-0.52525",
+    "riseholme_park_farm_strawberry_polytunnels": "53.26850,-0.52460",
+    "riseholme_park_farm_vineyard": "53.26810,-0.52440",
+}
+"""Real fields of one farm, each with a position that lies within its fence alone."""
+
+
+def test_fields_of_one_farm_answer_for_their_own(api: Api, fresh: Fresh, shared: Path) -> None:
+    made: dict[str, str] = {}
+    rings: dict[str, shapely.Polygon] = {}
+    for field in FIELDS:
+        made[field] = fresh()
+        root = shared / "data" / "environment_template" / field
+        api.post("environments", {"name": made[field]})
+        files = {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w") as archive:
+            for name, data in files.items():
+                archive.writestr(name, data)
+        api.upload(made[field], {"field.zip": packed.getvalue()})
+        text = files.get("config/location/datum.yaml", files["config/location/datum_autogen.yaml"]).decode()
+        coordinates = re.search(r"gnss_fence_coords: (\[\[.*?\]\])", text, re.DOTALL)
+        assert coordinates is not None
+        rings[field] = shapely.Polygon([(x, y) for y, x in json.loads(coordinates[1])])
+    boxes = [api.get(f"environments/{name}").json()["bounds"] for name in made.values()]
+
+    def answers(latitude: float, longitude: float) -> list[dict[str, Any]]:
+        found = api.get("environments", params={"contains": f"{latitude},{longitude}", "limit": 1000}).json()
+        return [e for e in found if e["name"] in made.values()]
+
+    for field, position in FIELDS.items():
+        latitude, longitude = map(float, position.split(","))
+        assert sum(w <= longitude <= e and s <= latitude <= n for w, s, e, n in boxes) > 1, "boxes would not tell"
+        (hit,) = answers(latitude, longitude)
+        assert hit["name"] == made[field]
+        area, _ = Geod(ellps="WGS84").geometry_area_perimeter(rings[field])
+        assert hit["match"]["by"] == "fence"
+        assert hit["match"]["area_m2"] == pytest.approx(abs(area), rel=0.01)
+    # What a hundred positions in and around the farm say, by the fences of the files.
+    for longitude, latitude in np.random.default_rng(1).uniform((-0.5260, 53.2678), (-0.5230, 53.2692), (100, 2)):
+        inside = {
+            made[field]
+            for field, ring in rings.items()
+            if shapely.make_valid(ring).covers(shapely.Point(longitude, latitude))
+        }
+        assert {e["name"] for e in answers(latitude, longitude)} == inside
+
+
+def test_pages_by_position(api: Api, fresh: Fresh) -> None:
+    names = sorted(fresh() for _ in range(5))
+    for k, name in enumerate(names):
+        api.post("environments", {"name": name, "datum": {"latitude": 10.0 + k * 1e-4, "longitude": 20.0}})
+    seen: list[str] = []
+    path: str | None = "/api/v1/environments?contains=10,20&limit=2"
+    while path is not None:
+        answer = api.get(path)
+        seen += [e["name"] for e in answer.json()]
+        path = answer.links["next"]["url"] if "next" in answer.links else None
+    assert seen == names, "the nearest datum first"
+    limited = api.token_for("viewer", environments=names[3])
+    assert [e["name"] for e in limited.get("environments", params={"contains": "10,20"}).json()] == [names[3]]
 
 
 def test_pages(api: Api, fresh: Fresh) -> None:

@@ -91,6 +91,28 @@ def test_all_environments_are_listed(fleetmap: Fleetmap, network: Path) -> None:
     assert len(fleetmap("versions", "--limit", "1", "--json").json) == 1
 
 
+def test_which_map_am_i_on(fleetmap: Fleetmap, network: Path) -> None:
+    assert fleetmap("import", network, "-e", "south-field", "--datum", "-33.9,18.4").status == 0
+    told = fleetmap("where", "-33.9,18.40002")
+    assert told.status == 0, told.err
+    assert "south-field" in told.out
+    assert "mapped floor" in told.out
+    told = fleetmap("where", "-33.9,18.40002", "--json")
+    (found,) = told.json
+    assert (found["name"], found["match"]["by"], told.status) == ("south-field", "floor", 0)
+    assert found["match"]["distance_m"] == pytest.approx(1.8, abs=0.1)
+    nowhere = fleetmap("where", "33.9,18.4")
+    assert (nowhere.status, nowhere.out) == (1, "")
+    assert "no environment contains 33.9,18.4" in nowhere.err
+    nowhere = fleetmap("where", "33.9,18.4", "--json")
+    assert (nowhere.status, nowhere.json) == (1, [])
+    for bad in ("91,0", "nan,0", "north", "1"):
+        wrong = fleetmap("where", bad)
+        assert wrong.status == 1
+        assert "LAT,LON" in wrong.err
+    assert fleetmap("where").status == 2
+
+
 def test_a_planned_promotion_waits(fleetmap: Fleetmap, network: Path) -> None:
     history(fleetmap, network, "planned")
     told = fleetmap("promote", "planned", "2", "--channel", "staging", "--at", "2099-01-31T06:00:00Z", "--json")

@@ -73,6 +73,42 @@ def test_maps_over_zenoh_are_the_bytes_of_http(api: Api, session: zenoh.Session)
         assert (told["status"], "without wildcards" in told["detail"]) == (422, True)
 
 
+def test_environments_by_position_are_those_of_http(api: Api, session: zenoh.Session) -> None:
+    for name, files in (("fenced", {"datum.yaml": samples.DATUM}), ("bare", None)):
+        api.post(
+            "environments", {"name": name, "datum": {"latitude": samples.LATITUDE, "longitude": samples.LONGITUDE}}
+        )
+        if files:
+            api.upload(name, files)
+
+    def get(parameters: str) -> Any:
+        reply = next(iter(session.get(f"fleetmap/server/where{parameters}", timeout=20.0)))
+        return reply.ok if reply.ok is not None else reply.err
+
+    answer = get("?lat=53.2687;lon=-0.5246")
+    found = json.loads(bytes(answer.payload))
+    assert found == api.get("environments", params={"contains": "53.2687,-0.5246"}).json()
+    assert [(e["name"], e["match"]["by"]) for e in found if e["name"] in ("fenced", "bare")] == [
+        ("fenced", "fence"),
+        ("bare", "datum"),
+    ]
+    assert str(answer.encoding) == "application/json"
+    assert json.loads(bytes(get("?lat=-53.2687;lon=-0.5246").payload)) == []
+    for bad in (
+        "",
+        "?lat=1",
+        "?lat=91;lon=0",
+        "?lat=nan;lon=0",
+        "?lat=a;lon=b",
+        "?lat=1;lon=2;crs=local",
+        "?lat=1,2;lon=3",
+    ):
+        refused = get(bad)
+        told = json.loads(bytes(refused.payload))
+        assert (told["status"], str(refused.encoding)) == (422, "application/problem+json"), bad
+        assert "lat" in told["detail"]
+
+
 def test_a_map_in_the_making_keeps_nobody_waiting(
     api: Api, session: zenoh.Session, port: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

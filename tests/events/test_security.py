@@ -110,6 +110,9 @@ def test_a_robot_hears_asks_and_tells(api: Api, r1: zenoh.Session) -> None:
     reply = next(iter(r1.get("fleetmap/farm/1/version", timeout=20.0)))
     assert reply.ok is not None
     assert json.loads(bytes(reply.ok.payload))["version"] == 1
+    reply = next(iter(r1.get("fleetmap/server/where?lat=53.2686;lon=-0.5245", timeout=20.0)))
+    assert reply.ok is not None
+    assert json.loads(bytes(reply.ok.payload)) == api.get("environments?contains=53.2686,-0.5245").json() == []
     alive = r1.liveliness().get("fleetmap/server", timeout=5.0)
     assert [str(one.ok.key_expr) for one in alive if one.ok] == ["fleetmap/server"]
     token = r1.liveliness().declare_token("fleetmap/robots/r1")

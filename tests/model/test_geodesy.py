@@ -14,7 +14,7 @@ from pyproj import CRS, Geod, Transformer
 from app.errors import Invalid, MissingDatum
 from app.model.features import NO_GEOMETRY, concatenate, features
 from app.model.frame import Datum
-from app.model.geodesy import LocalFrame, local_frame
+from app.model.geodesy import LocalFrame, distance, local_frame, surface
 
 WGS84 = Geod(ellps="WGS84")
 PLACES = [
@@ -33,6 +33,19 @@ DATUMS = st.builds(
     st.just(0.0),
     st.floats(-360, 360),
 )
+
+
+def test_distance_and_surface_are_geodesic() -> None:
+    assert distance((0.0, 0.0), (0.0, 1.0)) == pytest.approx(110574.4, abs=0.1)
+    assert distance((179.999, -17.0), (-179.999, -17.0)) == pytest.approx(212.9, abs=0.1)
+    # A square degree at the equator, known from the authalic latitude of its parallel.
+    assert surface(shapely.box(0, 0, 1, 1)) == pytest.approx(12_308_778_361, rel=1e-6)
+    assert surface(shapely.box(179.5, 0, 180.5, 1)) == pytest.approx(surface(shapely.box(0, 0, 1, 1)), rel=1e-9)
+    ring = shapely.box(0, 0, 2, 2)
+    hole = shapely.box(0.5, 0.5, 1, 1)
+    several = shapely.MultiPolygon([shapely.Polygon(ring.exterior, [hole.exterior]), shapely.box(5, 5, 6, 6)])
+    expected = surface(ring) - surface(hole) + surface(shapely.box(5, 5, 6, 6))
+    assert surface(several) == pytest.approx(expected, rel=1e-12)
 
 
 def around(latitude: float, longitude: float, metres: list[float]) -> np.ndarray:

@@ -75,7 +75,7 @@ def test_postgres_has_gist_indexes_and_uncompressed_chunks(postgres_url: str, tm
                 "AND c.relname LIKE 'ix\\_%' ORDER BY 1"
             )
         ).scalars()
-        assert list(methods) == ["ix_environment_extent", "ix_place_geometry"]
+        assert list(methods) == ["ix_area_geometry", "ix_environment_extent", "ix_place_geometry"]
         storage = connection.execute(
             sa.text("SELECT attstorage FROM pg_attribute WHERE attrelid = 'chunk'::regclass AND attname = 'data'")
         ).scalar_one()

@@ -1,0 +1,315 @@
+"""The area of an environment on earth: where a robot with a GNSS fix is taken to be in it.
+
+The area is, in this order:
+
+1. ``fence``: the polygons of the location layer (those of kind ``fence`` if there are any), on all levels, with holes;
+2. ``floor``: what is mapped as floor within ``NEIGHBOURHOOD_METRES`` of the datum, wider by ``MARGIN_METRES``: of each
+   occupancy grid that is no filter mask the rectangle around its free cells, of each network its convex hull, and all
+   objects of kind ``floor``;
+3. ``datum``: the circle of ``DATUM_METRES`` around the datum.
+
+A datum at exactly 0, 0 is a position that nobody has set: it gives no area. What stands in the local frame of such a
+datum, or of none, has no place on earth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from sqlalchemy import Connection, delete, insert
+
+from app.model import masks
+from app.model.features import Features
+from app.model.frame import Datum
+from app.model.geodesy import LocalFrame, local_frame, surface
+from app.model.grid import FREE
+from app.model.layers import Layer, PartKey
+from app.store import parts, tables, tree
+from app.store.changes import KEEP, Keep
+from app.store.encode import to_wkb
+from app.store.parts import PartRoot
+from app.store.tree import Draft
+from app.store.values import NO_AREA, Area, Box, PartEntry
+
+NEIGHBOURHOOD_METRES: Final = 2000.0
+"""Radius around the datum in which floor counts, in metres."""
+
+DATUM_METRES: Final = 200.0
+"""Radius around a datum without fence and floor, in metres."""
+
+MARGIN_METRES: Final = 10.0
+"""Added around floor, in metres: what a GNSS fix may be off, and lines that have no width."""
+
+AREA_LAYERS: Final[frozenset[Layer]] = frozenset({"location", "occupancy", "topology", "objects"})
+"""The layers that an area depends on."""
+
+MAX_FEATURES: Final = 2000
+MAX_CELLS: Final = 2**22
+"""Up to so many features and cells of one part the area is computed with the commit, beyond by the next query."""
+
+Array = NDArray[np.float64]
+
+FENCE: Final = "fence"
+FLOOR: Final = "floor"
+CIRCLE_SEGMENTS: Final = 16
+"""Straight pieces of a quarter of a circle."""
+
+
+def area_after(
+    draft: Draft,
+    before: Sequence[PartEntry],
+    after: Sequence[PartEntry],
+    old_datum: Datum | None,
+    datum: Datum | None,
+) -> Area | Literal[Keep.KEEP] | None:
+    """Compute the area after a change.
+
+    Returns KEEP if it is the one before, None if it takes longer than a commit should.
+    """
+    changed = {key.layer for key, _ in _hashes(before) ^ _hashes(after)}
+    if old_datum == datum and not changed & AREA_LAYERS:
+        return KEEP
+    fence = _fence(draft, after, datum)
+    if fence is not None:
+        return KEEP if old_datum == datum and "location" not in changed else area_on_earth(FENCE, fence)
+    if any(e.count > (MAX_CELLS if e.key.layer == "occupancy" else MAX_FEATURES) for e in _floors(after, datum)):
+        return None
+    return _guess(draft, after, datum)
+
+
+def area_of(draft: Draft, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
+    """Compute the area of a version's content, whatever it takes."""
+    fence = _fence(draft, entries, datum)
+    return _guess(draft, entries, datum) if fence is None else area_on_earth(FENCE, fence)
+
+
+def _hashes(entries: Iterable[PartEntry]) -> set[tuple[PartKey, str]]:
+    return {(e.key, e.hash) for e in entries}
+
+
+def _frame(datum: Datum | None) -> LocalFrame | None:
+    return None if datum is None or datum.latitude == 0.0 == datum.longitude else local_frame(datum)
+
+
+def _load(draft: Draft, entries: Iterable[PartEntry]) -> list[Features]:
+    loaded = parts.load(draft, {e.key: bytes.fromhex(e.hash) for e in entries}, lambda _: {})
+    return [part for part in loaded.values() if isinstance(part, Features)]
+
+
+# --- fence ---
+
+
+def _fence(draft: Draft, entries: Sequence[PartEntry], datum: Datum | None) -> Any:
+    """The fence as a valid (Multi)Polygon in degrees, beyond ±180 across the antimeridian; None if it has no area."""
+    sites = _load(draft, (e for e in entries if e.key.layer == "location" and e.count))
+    return fence_of(sites, _frame(datum))
+
+
+def fence_of(sites: Sequence[Features], frame: LocalFrame | None) -> Any:
+    """The polygons of location parts as one, see ``_fence``; local ones only with a frame."""
+    polygons: list[Any] = []
+    fences: list[Any] = []
+    for site in sites:
+        flat = np.isin(shapely.get_type_id(site.geometry), (3, 6)) & ~shapely.is_empty(site.geometry)
+        chosen = site.take(flat & ~site.local if frame is None else flat)
+        for place, properties in zip(chosen.in_wgs84(frame), chosen.properties, strict=True):
+            pieces = [_unwrapped(p) for p in shapely.get_parts(shapely.force_2d(place))]
+            (fences if properties.get("kind") == FENCE else polygons).extend(p for p in pieces if p is not None)
+    for group in (fences, polygons):
+        joined = _polygonal(shapely.union_all(group))
+        if joined is not None:
+            return joined
+    return None
+
+
+def _unwrapped(polygon: Any) -> Any:
+    """A polygon in degrees as a valid one; wider than half the globe it crosses the antimeridian, and goes on there."""
+    if not np.isfinite(shapely.get_coordinates(polygon)).all():
+        return None
+    west, _, east, _ = polygon.bounds
+    if east - west > 180.0:
+        polygon = shapely.transform(polygon, lambda xy: np.column_stack([xy[:, 0] % 360.0, xy[:, 1]]))
+    return _polygonal(shapely.make_valid(polygon))
+
+
+def _polygonal(shape: Any) -> Any:
+    """The polygons of a shape as one; None if they have no area."""
+    pieces = [p for p in shapely.get_parts(shapely.get_parts(shape)) if p.geom_type == "Polygon" and p.area > 0]
+    return shapely.union_all(pieces) if pieces else None
+
+
+# --- floor and datum ---
+
+
+def _floors(entries: Iterable[PartEntry], datum: Datum | None) -> list[PartEntry]:
+    """The parts that may hold floor."""
+    if _frame(datum) is None:
+        return []
+    found = [e for e in entries if e.count and e.key.layer in AREA_LAYERS - {"location"}]
+    return [e for e in found if e.key.layer != "occupancy" or e.key.name not in masks.MASKS]
+
+
+def _guess(draft: Draft, entries: Sequence[PartEntry], datum: Datum | None) -> Area:
+    """The area of an environment without a fence."""
+    frame = _frame(datum)
+    if frame is None:
+        return NO_AREA
+    near = shapely.Point(0.0, 0.0).buffer(NEIGHBOURHOOD_METRES, quad_segs=CIRCLE_SEGMENTS)
+    shapes: list[Any] = []
+    for entry in _floors(entries, datum):
+        if entry.key.layer == "occupancy":
+            root = parts.read_root(draft, bytes.fromhex(entry.hash))
+            shapes.append(None if masks.NAME in root.header["properties"] else free_rectangle(draft, root))
+            continue
+        for part in _load(draft, [entry]):
+            if entry.key.layer == "topology":
+                shapes.append(_hull(part, frame, near))
+            else:
+                shapes += _floor_objects(part, frame)
+    wide = [shapely.buffer(s, MARGIN_METRES, quad_segs=4) for s in shapes if s is not None]
+    floor = _polygonal(shapely.intersection(shapely.union_all(wide), near)) if wide else None
+    if floor is not None:
+        return area_on_earth(FLOOR, _on_earth(floor, frame))
+    circle = shapely.Point(0.0, 0.0).buffer(DATUM_METRES, quad_segs=CIRCLE_SEGMENTS)
+    return area_on_earth("datum", _on_earth(circle, frame), size=round(math.pi * DATUM_METRES**2, 1))
+
+
+def _in_metres(part: Features, frame: LocalFrame) -> NDArray[np.object_]:
+    """A part's geometries in metres, without those that are too far away for the local frame."""
+    out = np.asarray(shapely.force_2d(part.geometry), object).copy()
+    distant = ~part.local
+    if distant.any():
+        out[distant] = shapely.transform(out[distant], frame.to_local)
+    finite = np.isfinite(shapely.bounds(out)).all(axis=1)
+    return np.asarray(out[finite & ~shapely.is_empty(out)], object)
+
+
+def _hull(network: Features, frame: LocalFrame, near: Any) -> Any:
+    """The convex hull, in metres, of what a network has in the neighbourhood; None if that is nothing."""
+    shapes = _in_metres(network, frame)
+    inside = np.abs(shapely.bounds(shapes)).max(axis=1, initial=0.0) <= NEIGHBOURHOOD_METRES
+    shapes[~inside] = shapely.intersection(shapely.make_valid(shapes[~inside]), near)
+    points = shapely.get_coordinates(shapes)
+    return shapely.convex_hull(shapely.multipoints(points)) if len(points) else None
+
+
+def _floor_objects(part: Features, frame: LocalFrame) -> list[Any]:
+    floors = part.take([k for k, p in enumerate(part.properties) if p.get("kind") == FLOOR])
+    flat = [s for s in _in_metres(floors, frame) if s.geom_type in ("Polygon", "MultiPolygon")]
+    return [p for p in (_polygonal(shapely.make_valid(s)) for s in flat) if p is not None]
+
+
+def free_rectangle(draft: Draft, grid: PartRoot) -> Any:
+    """The rectangle in metres around a stored grid's free cells, turned as the grid is; None if no cell is free.
+
+    Reads the grid tile by tile, equal tiles once.
+    """
+    node, header = grid.trees["tiles"], grid.header
+    if node is None:
+        return None
+    (leaves,) = tree.leaves(draft, [node])
+    raws = draft.read_many(leaves)
+    codes: dict[bytes, list[int]] = {}
+    for leaf in leaves:
+        for code, name in parts.tile_leaf(raws[leaf]):
+            codes.setdefault(name, []).append(code)
+    boxes: list[tuple[int, int, int, int]] = []
+    names = list(codes)
+    for start in range(0, len(names), parts.TILE_BATCH):
+        for name, raw in draft.stream(names[start : start + parts.TILE_BATCH]).items():
+            boxes += _free_boxes(header, parts.tile_cells(raw) == FREE, codes[name])
+    if not boxes:
+        return None
+    found = np.array(boxes, np.float64)
+    u0, v0 = found[:, :2].min(axis=0).tolist()
+    u1, v1 = found[:, 2:].max(axis=0).tolist()
+    x, y, yaw = header["origin"]
+    along, across = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
+    corners = np.array([along * u + across * v for u, v in ((u0, v0), (u1, v0), (u1, v1), (u0, v1))])
+    return shapely.Polygon(corners * header["resolution"] + np.array([x, y]))
+
+
+def _free_boxes(header: Mapping[str, Any], free: NDArray[np.bool_], codes: Sequence[int]) -> list[Any]:
+    """(first column, first row, end column, end row) of the free cells of equal tiles, each where it lies."""
+    out: list[Any] = []
+    if not free.any():
+        return out
+    for code in codes:
+        row, column, height, width = parts.tile_shape(header, code)
+        cells = free.reshape(height, width)
+        rows, columns = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
+        out.append((column + columns[0], row + rows[0], column + columns[-1] + 1, row + rows[-1] + 1))
+    return out
+
+
+def _on_earth(shape: Any, frame: LocalFrame) -> Any:
+    """A shape in metres as one in degrees that goes on beyond ±180 across the antimeridian."""
+    around = frame.datum.longitude
+
+    def change(xy: Array) -> Array:
+        out = frame.to_wgs84(xy)
+        out[:, 0] = (out[:, 0] - around + 180.0) % 360.0 - 180.0 + around
+        return out
+
+    return _polygonal(shapely.make_valid(shapely.transform(shape, change)))
+
+
+def area_on_earth(by: Literal["fence", "floor", "datum"], shape: Any, size: float | None = None) -> Area:
+    """An area from a (Multi)Polygon in degrees that goes on beyond ±180, cut there and, if that leaves pieces on both
+    sides of the globe, into its eastern and western half.
+    """
+    pieces = []
+    for turn in (-360.0, 0.0, 360.0):
+        cut = shapely.intersection(shape, shapely.box(-180.0 + turn, -90.0, 180.0 + turn, 90.0))
+        pieces.append(shapely.transform(cut, lambda xy, turn=turn: xy - np.array([turn, 0.0])))
+    whole = _polygonal(shapely.union_all(pieces))
+    if whole is None:
+        return NO_AREA
+    west, _, east, _ = whole.bounds
+    if east - west > 180.0:
+        halves = [
+            _polygonal(shapely.intersection(whole, shapely.box(w, -90.0, w + 180.0, 90.0))) for w in (-180.0, 0.0)
+        ]
+    else:
+        halves = [whole]
+    found = [half for half in halves if half is not None]
+    return Area(
+        by,
+        round(sum(surface(half) for half in found) if size is None else size, 1),
+        tuple((_box(half), bytes(to_wkb(np.array([half], object))[0])) for half in found),
+    )
+
+
+def _box(shape: Any) -> Box:
+    west, south, east, north = shape.bounds
+    return float(west), float(south), float(east), float(north)
+
+
+# --- rows ---
+
+
+def put_area(connection: Connection, environment_id: str, area: Area) -> None:
+    """Write an environment's area in place of what was there. The caller holds the environment's row."""
+    table = tables.area
+    connection.execute(delete(table).where(table.c.environment_id == environment_id))
+    rows = [
+        {
+            "environment_id": environment_id,
+            "piece": number,
+            "basis": area.by,
+            "size": area.size,
+            "west": west,
+            "south": south,
+            "east": east,
+            "north": north,
+            "geometry": wkb,
+        }
+        for number, ((west, south, east, north), wkb) in enumerate(area.pieces)
+    ]
+    if rows:
+        connection.execute(insert(table), rows)
