@@ -47,8 +47,12 @@ def list_keys(here: Here, _: Viewer) -> Response:
     "/keys", status_code=201, responses=told(KeyOut, ok=201, description="The new key"), summary="Rotate the key"
 )
 def rotate_key(here: Here, _: Admin) -> Response:
-    """From now on a new key signs. Robots that trust the old one follow, since it vouches for the new one."""
+    """From now on a new key signs. Robots that trust the old one follow, since it vouches for the new one.
+
+    Signed links get a new secret as well; links that were made before stay valid until they expire.
+    """
     made = here.keys.rotate()
+    here.links.rotate()
     here.store.generation.change()  # what was signed with the old key is in memory no longer
     return answer(made.as_dict(), 201)
 

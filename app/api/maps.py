@@ -33,10 +33,12 @@ from app.api.jobs import Started, started
 from app.api.metrics import Metrics
 from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, told
 from app.api.services import Here, Services
+from app.api.signed import LINK
 from app.api.together import Together
 from app.convert import Recipe
 from app.convert.cache import Made, MadeFile
-from app.errors import CannotDerive, Invalid, NotFound, Problem
+from app.errors import CannotDerive, Invalid, NotFound, Problem, Unavailable
+from app.links import SignedAddress
 from app.store.values import LATEST, Version
 
 FRESH_SECONDS = 1.0
@@ -66,7 +68,7 @@ class Wanted:
 @dataclass(frozen=True, slots=True, eq=False)
 class Resource:
     """What stands at an address. recipe: None where it is no map. body: None while it is not made, or too large for
-    memory; path: then its file.
+    memory; path: then its file. link_expires: seconds since 1970, of a signed link; None where a token is needed.
     """
 
     wanted: Wanted
@@ -82,6 +84,7 @@ class Resource:
     generation: int
     fresh_until: float
     tally: list[int]
+    link_expires: int | None = None
 
 
 class Hot:
@@ -109,7 +112,8 @@ class Hot:
         if fresh is not None and (fresh.body is not None or fresh.path is not None):
             return fresh
         wanted = wanted_of(request)
-        values, derive = _options(key[1])
+        link = link_of(request)
+        values, derive = _options(key[1] if link is None else link.query)
         # Taken before anything is read: a commit in between makes this answer stale, never fresh.
         generation, until = self.generation(), time.monotonic() + FRESH_SECONDS
         while True:
@@ -120,6 +124,8 @@ class Hot:
                 self._put(key, fresh)
                 return fresh
             empty = self._resource(wanted, recipe, values, derive, generation, until, _route(request))
+            if link is not None:
+                empty = _by_link(empty, link)
             if _matches(request, empty.etag):
                 self._put(key, empty)
                 return empty
@@ -222,6 +228,22 @@ class Hot:
                 self._size -= _weight(self._entries.popitem(last=False)[1])
 
 
+def link_of(request: Request) -> SignedAddress | None:
+    """The signed link, already checked, that a request was made by."""
+    link: SignedAddress | None = request.scope["state"].get(LINK)
+    return link
+
+
+def _by_link(resource: Resource, link: SignedAddress) -> Resource:
+    """The same for a link: only its holder may cache it, and no page learns the link as a referrer."""
+
+    def private(headers: Headers) -> Headers:
+        others = [(name, value) for name, value in headers if name != b"cache-control"]
+        return [*others, (b"cache-control", b"private, no-cache"), (b"referrer-policy", b"no-referrer")]
+
+    return replace(resource, headers=private(resource.headers), bare=private(resource.bare), link_expires=link.expires)
+
+
 def _key(request: Request) -> Key:
     scope = request.scope
     return (scope.get("raw_path") or scope["path"].encode(), scope["query_string"])
@@ -276,8 +298,7 @@ def _filled(empty: Resource, made: Made) -> Resource:
     name = empty.wanted.file
     file = made.whole() if name is None else made.file(name)
     if file is None:
-        names = ", ".join(f.name for f in made.files[:20])
-        raise NotFound(f"this map has no file {name!r}; its files are: {names}")
+        raise no_such_file(made, name)
     headers = [
         (b"content-type", _media_type(file).encode()),
         (b"accept-ranges", b"bytes"),
@@ -290,6 +311,12 @@ def _filled(empty: Resource, made: Made) -> Resource:
     body = file.path.read_bytes()
     headers.insert(0, (b"content-length", str(len(body)).encode()))
     return replace(empty, headers=headers, size=len(body), body=body, sha256=file.sha256)
+
+
+def no_such_file(made: Made, name: str | None) -> NotFound:
+    """The error for a file that a map does not have."""
+    names = ", ".join(f.name for f in made.files[:20])
+    return NotFound(f"this map has no file {name!r}; its files are: {names}")
 
 
 def _dictionary(wanted: Wanted) -> str:
@@ -326,8 +353,9 @@ def _route(request: Request) -> str:
 
 
 def address_of(request: Request) -> str:
-    """The request's own address, to be asked for again."""
-    query = request.url.query
+    """The request's own address, to be asked for again; without the signature of a link."""
+    link = link_of(request)
+    query = request.url.query if link is None else link.query.decode()
     return quote(request.scope["path"], safe="/") + (f"?{quote(query, safe='&=%,.:+-_~/')}" if query else "")
 
 
@@ -387,8 +415,11 @@ def _reply(
             condition = value
         elif name in (b"range", b"if-match", b"available-dictionary"):
             return None
-    who = hot.access.known(authorization)
-    if who is None or not who.may_enter(found.wanted.environment):
+    if found.link_expires is None:
+        who = hot.access.known(authorization)
+        if who is None or not who.may_enter(found.wanted.environment):
+            return None
+    elif found.link_expires <= time.time():  # the signature is part of the key: it was checked with the first request
         return None
     if hot.access.insecure and not is_from_here(dict(headers)):
         return None
@@ -411,6 +442,8 @@ async def download(template: str, request: Request) -> Response:
     who: Principal = request.scope["state"]["principal"]
     found = await here.hot.find(request, here, who)
     if isinstance(found, Started):
+        if link_of(request) is not None:  # its holder has no token to follow a job with
+            raise Unavailable("the map is still being converted: try again in a few seconds")
         return started(found.job)
     if none_match(request.headers.get("if-none-match"), found.etag):
         return _response(304, found.bare)
@@ -509,6 +542,25 @@ def add_routes(app: FastAPI) -> None:
     base = f"{API}/environments/{{env}}/versions/{{v}}/maps/{{format}}"
     for path in (base, base + "/{file:path}", "/maps/{env}/{format}", "/maps/{env}/{format}/{file:path}"):
         app.router.add_route(path, partial(download, path), methods=["GET"], include_in_schema=False)
+
+
+async def made_at(here: Services, wanted: Wanted, query: bytes, who: Principal) -> tuple[Recipe, Made] | Started:
+    """The map that an address of a version's number gives, made where need be; the job that makes it if it takes long.
+
+    query: the map's parameters, percent-encoded.
+    """
+    values, derive = _options(query)
+    path = path_of("environments", wanted.environment, "versions", wanted.version, "maps", wanted.format)
+    while True:
+        recipe = await run_in_threadpool(_resolve, here, wanted, values, derive)
+        made = await run_in_threadpool(here.maps.ready, recipe)
+        if made is not None:
+            return recipe, made
+        try:
+            outcome = await here.work.make(recipe, who, f"{path}?{query.decode()}" if query else path)
+        except CannotDerive:
+            continue  # it is remembered: the next recipe goes another way, or says that there is none
+        return outcome if isinstance(outcome, Started) else (recipe, outcome)
 
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=Route)

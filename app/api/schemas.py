@@ -422,6 +422,27 @@ class OverlayBody(In):
     detail: str | None = Field(None, max_length=2000)
 
 
+class LinkBody(In):
+    """The map, or one file of it, that a signed link gives."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={"examples": [{"format": "geojson", "file": "map.geojson", "seconds": 3600}]},
+    )
+
+    format: str = Field(max_length=64, description="A format's id.")
+    file: str | None = Field(
+        None, min_length=1, max_length=1000, description="One file of the map; left out: the file itself or a zip."
+    )
+    parameters: dict[str, str | int | float | bool] = Field(
+        default_factory=dict, max_length=50, description="Parameters of the map, as in its address."
+    )
+    seconds: int | None = Field(
+        None, ge=1, description="Life of the link. Default and maximum: the setting `FLEETMAP_LINK_SECONDS`."
+    )
+
+
 class TokenBody(In):
     """A new token."""
 
@@ -818,6 +839,18 @@ class NewTokenOut(TokenOut):
     """A new token with its secret, which is told only now."""
 
     token: str
+
+
+class LinkOut(BaseModel):
+    """A signed link, and the file that it gives."""
+
+    url: str = Field(description="Needs no token until it expires. Whoever has it can read this map.")
+    expires: datetime
+    version: int
+    root: str
+    name: str = Field(description="Of the file.")
+    size: int = Field(description="Bytes.")
+    sha256: str
 
 
 class DiffOut(BaseModel):

@@ -1,0 +1,107 @@
+"""Signed links to maps, for clients that have no place for a token."""
+
+from __future__ import annotations
+
+from typing import Any
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Request
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import Response
+
+from app.api.access import Principal, Viewer
+from app.api.answers import API, Route, answer
+from app.api.jobs import Started, started
+from app.api.maps import Wanted, made_at, no_such_file, number_of
+from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, told
+from app.api.services import Here, Services
+from app.convert.cache import MadeFile
+from app.errors import Invalid, Problem
+from app.store.values import Version, rfc3339
+
+router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=Route)
+
+
+@router.post(
+    "/links",
+    status_code=201,
+    responses={
+        **told(LinkOut, 400, 404, 409, 415, ok=201, description="The link"),
+        202: {"description": "The map takes long: follow the job at `Location`, then ask again."},
+    },
+    summary="Create a signed link to a map",
+)
+async def create_link(
+    env: EnvironmentPath, v: VersionPath, body: LinkBody, request: Request, here: Here, who: Viewer
+) -> Response:
+    """The `url` needs no token until it `expires`, for `GET` and `HEAD` alone.
+
+    It names the version by number, so that its bytes stay the same, and ends with the environment. It does not outlive
+    the token that created it, but is not revoked with it. The map is converted first: a map that cannot be made has no
+    link.
+    """
+    if body.seconds is not None and body.seconds > here.links.max_seconds:
+        raise Invalid(
+            f"seconds must be at most {here.links.max_seconds}",
+            [Problem(f"at most {here.links.max_seconds}", where="body.seconds")],
+        )
+    version = await run_in_threadpool(here.store.version, env, number_of(v))
+    values = {name: _text(value) for name, value in body.parameters.items()}
+    linked = await link_to(here, request, who, version, body.format, body.file, values, body.seconds)
+    if isinstance(linked, Started):
+        return started(linked.job)
+    url, expires, file = linked
+    out = {
+        "url": url,
+        "expires": expires,
+        "version": version.number,
+        "root": version.root,
+        "name": file.name,
+        "size": file.size,
+        "sha256": file.sha256,
+    }
+    return answer(out, 201, {"cache-control": "no-store"})
+
+
+async def link_to(
+    here: Services,
+    request: Request,
+    who: Principal,
+    version: Version,
+    format: str,
+    file: str | None,
+    values: dict[str, str],
+    seconds: int | None = None,
+) -> tuple[str, str, MadeFile] | Started:
+    """A link to a version's map or one of its files: full address, expiry (RFC 3339), the file that it gives.
+
+    Args:
+        values: the map's parameters, as in its address.
+        seconds: default: the maximum.
+
+    Raises what converting raises; NotFound for a file that the map does not have.
+    """
+    wanted = Wanted(version.environment, str(version.number), format, file)
+    outcome = await made_at(here, wanted, urlencode(sorted(values.items())).encode(), who)
+    if isinstance(outcome, Started):
+        return outcome
+    _, made = outcome
+    found = made.whole() if file is None else made.file(file)
+    if found is None:
+        raise no_such_file(made, file)
+    path = f"{API}/environments/{version.environment}/versions/{version.number}/maps/{format}"
+    path += "" if file is None else f"/{file}"
+
+    def sign() -> Any:
+        environment = here.store.environment(version.environment)
+        return here.links.create(environment, path, values, seconds or here.links.max_seconds, who)
+
+    grant = await run_in_threadpool(sign)
+    return str(request.base_url).rstrip("/") + grant.url, rfc3339(grant.expires), found
+
+
+def _text(value: str | float | bool) -> str:
+    """A parameter as an address has it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return value if isinstance(value, str) else repr(value)
