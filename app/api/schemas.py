@@ -459,7 +459,12 @@ class TokenBody(In):
     environments: str | None = Field(
         None, min_length=1, max_length=200, description="Name pattern (`farm-*`) of the environments it reaches."
     )
-    robot: str | None = Field(None, min_length=1, max_length=200, description="The robot whose status it may set.")
+    robot: str | None = Field(
+        None,
+        min_length=1,
+        max_length=200,
+        description="Role `robot`: the robot whose status it may set. Default: `name`.",
+    )
     expires: Moment | None = Field(None, description="RFC 3339 time with zone; left out: never.")
 
 

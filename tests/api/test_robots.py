@@ -167,7 +167,7 @@ def test_who_may_tell(api: Api, farm: str, bare: str) -> None:
         caller("PUT", "robots/r-1/status", 200, json=said)
     assert "names the robot r-1" in mine.problem("PUT", "robots/r-2/status", 403, json=said)["detail"]
     mine.problem("PUT", "robots/r-1/status", 403, json=status(bare, "a" * 64))
-    assert "names no robot" in api.token_for("robot").problem("PUT", "robots/r-1/status", 403, json=said)["detail"]
+    assert "the robot a-robot" in api.token_for("robot").problem("PUT", "robots/r-1/status", 403, json=said)["detail"]
     api.token_for("viewer").problem("PUT", "robots/r-1/status", 403, json=said)
     mine.problem("DELETE", f"robots/r-1?environment={farm}", 403)
     other = api.token_for("viewer", environments=bare)

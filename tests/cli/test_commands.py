@@ -226,10 +226,20 @@ def test_link_gives_a_map_without_a_token(fleetmap: Fleetmap, network: Path) -> 
     assert (newest["version"], newest["name"]) == (2, "network.tmap2.yaml")
     with urllib.request.urlopen(newest["url"]) as answer:
         assert len(answer.read()) == newest["size"]
-    for wrong in (("octomap",), ("tmap2", "other.yaml"), ("tmap2", "--seconds", "99999999")):
+    for wrong in (("nonsense",), ("tmap2", "other.yaml"), ("tmap2", "--seconds", "99999999")):
         refused = fleetmap("link", "linked", *wrong)
         assert (refused.status, refused.out) == (1, "")
         assert "error:" in refused.err
+
+
+def test_robot_token_names_its_robot(fleetmap: Fleetmap) -> None:
+    assert fleetmap("token", "create", "mower-9", "--role", "robot", "--json").json["robot"] == "mower-9"
+    made = fleetmap("token", "create", "the red one", "--role", "robot", "--robot", "mower-9")
+    assert (made.status, "sets the status of the robot mower-9" in made.err) == (0, True)
+    for wrong in (("the red one", "--role", "robot"), ("x", "--role", "robot", "--robot", "a b")):
+        refused = fleetmap("token", "create", *wrong)
+        assert (refused.status, refused.out) == (1, "")
+        assert "--robot" in refused.err
 
 
 def test_usage_errors_have_their_own_status(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:
