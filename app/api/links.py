@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-from urllib.parse import urlencode
+from dataclasses import dataclass
+from urllib.parse import quote, urlencode
 
 from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
@@ -15,8 +15,8 @@ from app.api.jobs import Started, started
 from app.api.maps import Wanted, made_at, no_such_file, number_of
 from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, told
 from app.api.services import Here, Services
+from app.api.signed import Grant
 from app.convert.cache import MadeFile
-from app.errors import Invalid, Problem
 from app.store.values import Version, rfc3339
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=Route)
@@ -40,27 +40,31 @@ async def create_link(
     the token that created it, but is not revoked with it. The map is converted first: a map that cannot be made has no
     link.
     """
-    if body.seconds is not None and body.seconds > here.links.max_seconds:
-        raise Invalid(
-            f"seconds must be at most {here.links.max_seconds}",
-            [Problem(f"at most {here.links.max_seconds}", where="body.seconds")],
-        )
+    here.links.check_life(body.seconds)
     version = await run_in_threadpool(here.store.version, env, number_of(v))
     values = {name: _text(value) for name, value in body.parameters.items()}
     linked = await link_to(here, request, who, version, body.format, body.file, values, body.seconds)
     if isinstance(linked, Started):
         return started(linked.job)
-    url, expires, file = linked
     out = {
-        "url": url,
-        "expires": expires,
+        "url": linked.url,
+        "expires": linked.expires,
         "version": version.number,
         "root": version.root,
-        "name": file.name,
-        "size": file.size,
-        "sha256": file.sha256,
+        "name": linked.file.name,
+        "size": linked.file.size,
+        "sha256": linked.file.sha256,
     }
     return answer(out, 201, {"cache-control": "no-store"})
+
+
+@dataclass(frozen=True, slots=True)
+class LinkedFile:
+    """A file behind a link. url: full address. expires: RFC 3339; None for a link that needs a token."""
+
+    url: str
+    expires: str | None
+    file: MadeFile
 
 
 async def link_to(
@@ -72,12 +76,15 @@ async def link_to(
     file: str | None,
     values: dict[str, str],
     seconds: int | None = None,
-) -> tuple[str, str, MadeFile] | Started:
-    """A link to a version's map or one of its files: full address, expiry (RFC 3339), the file that it gives.
+    *,
+    signed: bool = True,
+) -> LinkedFile | Started:
+    """Convert a version's map, and link to it or to one of its files; the job where converting takes long.
 
     Args:
         values: the map's parameters, as in its address.
-        seconds: default: the maximum.
+        seconds: life of the link; default: the maximum.
+        signed: whether the link needs no token.
 
     Raises what converting raises; NotFound for a file that the map does not have.
     """
@@ -92,12 +99,17 @@ async def link_to(
     path = f"{API}/environments/{version.environment}/versions/{version.number}/maps/{format}"
     path += "" if file is None else f"/{file}"
 
-    def sign() -> Any:
+    base = str(request.base_url).rstrip("/")
+    if not signed:
+        query = urlencode(sorted(values.items()))
+        return LinkedFile(base + quote(path, safe="/") + (f"?{query}" if query else ""), None, found)
+
+    def sign() -> Grant:
         environment = here.store.environment(version.environment)
         return here.links.create(environment, path, values, seconds or here.links.max_seconds, who)
 
     grant = await run_in_threadpool(sign)
-    return str(request.base_url).rstrip("/") + grant.url, rfc3339(grant.expires), found
+    return LinkedFile(base + grant.url, rfc3339(grant.expires), found)
 
 
 def _text(value: str | float | bool) -> str:

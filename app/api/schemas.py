@@ -888,20 +888,36 @@ class OverlayOut(BaseModel):
     version: int | None = Field(None, description="That an accepted one went into.")
 
 
-class ActionsOut(BaseModel):
-    """Instant actions of VDA 5050 for one version."""
+class FloorActionsOut(BaseModel):
+    """Instant actions of VDA 5050 for one floor of a version."""
 
     model_config = ConfigDict(populate_by_name=True)
 
     map_id: str = Field(alias="mapId")
     map_version: str = Field(alias="mapVersion")
-    environment: str
-    version: int
-    root: str
+    level: str | None = Field(description="Null where no level was named.")
     size: int = Field(description="Bytes behind the link.")
+    expires: datetime | None = Field(description="End of the link; null where it needs a token.")
     download_map: dict[str, Any] = Field(alias="downloadMap")
     enable_map: dict[str, Any] = Field(alias="enableMap")
     delete_map: dict[str, Any] = Field(alias="deleteMap")
+
+
+class MissingLevelOut(BaseModel):
+    """A level without such a map, and why."""
+
+    level: str
+    detail: str
+
+
+class ActionsOut(FloorActionsOut):
+    """Instant actions of VDA 5050 for one version: of its first floor, and in ``maps`` of each."""
+
+    environment: str
+    version: int
+    root: str
+    maps: list[FloorActionsOut]
+    missing: list[MissingLevelOut] = Field(description="With `level=*`: levels that have no such map.")
 
 
 class StateOut(BaseModel):

@@ -14,7 +14,7 @@ from starlette.types import Scope
 from app import links
 from app.api.access import Access, Principal
 from app.api.answers import API
-from app.errors import InvalidLink, NotFound
+from app.errors import Invalid, InvalidLink, NotFound, Problem
 from app.links import LinkSecrets, SignedAddress
 from app.store.values import Environment
 
@@ -61,6 +61,12 @@ class SignedLinks:
     ) -> None:
         self._secrets, self._access, self._find, self._clock = secrets, access, find, clock
         self.max_seconds = max_seconds
+
+    def check_life(self, seconds: int | None) -> None:
+        """Invalid for a link that should live longer than the maximum."""
+        if seconds is not None and seconds > self.max_seconds:
+            limit = f"at most {self.max_seconds} (FLEETMAP_LINK_SECONDS)"
+            raise Invalid(f"seconds must be {limit}, got {seconds}", [Problem(f"must be {limit}", where="seconds")])
 
     def create(
         self, environment: Environment, path: str, parameters: Mapping[str, str], seconds: int, creator: Principal
