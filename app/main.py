@@ -296,8 +296,16 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
             LinkSecrets(settings.data_dir / "keys"), access, store.environment, int(settings.link_seconds)
         ),
         deltas=Deltas(service.cache),
-        fleet=FleetIntake(store),
+        fleet=FleetIntake(store, bus_vouches=_bus_vouches(settings)),
     )
+
+
+def _bus_vouches(settings: Settings) -> bool:
+    """Whether only known users reach the router, so that a robot's report on it is the robot's own.
+
+    Of another router all that is known is that the server itself had to log in. Without tokens everybody counts.
+    """
+    return settings.insecure_no_auth or settings.zenoh_users is not None or settings.zenoh_user is not None
 
 
 def provider_of(settings: Settings) -> Provider | None:

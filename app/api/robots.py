@@ -161,6 +161,7 @@ def _told(here: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
             "since": rfc3339(robot.since),
             "holds": held and {"version": held.version, "root": held.root, "since": rfc3339(held.since)},
             "online": fleet.is_online(robot, now),
+            "vouched": robot.vouched,
             "lag": lag,
         }
         out.append(body)

@@ -642,7 +642,7 @@ class ChannelRobotsOut(BaseModel):
     holding: int
     lagging: int
     failed: int
-    ready: int
+    ready: int = Field(description="Those that have the planned version and count in its roll-out (`vouched`).")
     since: datetime | None
 
 
@@ -711,6 +711,10 @@ class RobotOut(BaseModel):
     since: datetime
     holds: HoldsOut | None
     online: bool
+    vouched: bool = Field(
+        description="Whether a report came with authority (by a token that may report for it, or over a router with "
+        "users). Other robots do not count in roll-outs."
+    )
     lag: LagOut | None
 
 

@@ -171,10 +171,11 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
     values: dict[str, Any] = {**said, "said": report.said, "time": heard.time}
     again = known is not None and all(getattr(known, name) == value for name, value in said.items())
     if known is not None and not again and _told_before(connection, environment_id, heard, said):
-        connection.execute(update(table).where(*own).values(time=heard.time))
+        connection.execute(update(table).where(*own).values(time=heard.time, vouched=known.vouched or heard.vouched))
         return None
     if not again:
         values["since"] = heard.time
+    values["vouched"] = heard.vouched or (known is not None and known.vouched)
     if report.state == "active":
         same = known is not None and known.held_root == report.root
         values |= {"held_version": report.version, "held_root": report.root, "held_sequence": report.sequence}
@@ -251,4 +252,6 @@ def _as_robot(row: Row[Any]) -> Robot:
     held = None
     if row.held_root is not None:
         held = Held(row.held_version, row.held_root, row.held_sequence, row.held_since)
-    return Robot(row.robot, row.environment, _as_report(row), row.time, row.since, held, row.there, row.seen)
+    return Robot(
+        row.robot, row.environment, _as_report(row), row.time, row.since, held, row.there, row.seen, row.vouched
+    )

@@ -410,12 +410,16 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A report, of whom, and when it was heard by the server's clock."""
+    """A report, of whom, and when it was heard by the server's clock.
+
+    vouched: whether it came with authority: with a token that may report for the robot, or over a router with users.
+    """
 
     environment: str
     robot: str
     report: Report
     time: datetime
+    vouched: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -433,7 +437,8 @@ class Robot:
     """A robot in one environment, as it is now.
 
     time: of its last report. since: when it first said the same. there: its liveliness on the bus, as of ``seen``;
-    None where it never was on the bus.
+    None where it never was on the bus. vouched: whether any of its reports came with authority, so that it counts in
+    roll-outs.
     """
 
     robot: str
@@ -444,6 +449,7 @@ class Robot:
     held: Held | None
     there: bool | None = None
     seen: datetime | None = None
+    vouched: bool = True
 
     def failed_with(self, root: str) -> bool:
         """Whether it says that it failed with a version."""

@@ -33,6 +33,7 @@ def test_a_robot_tells_its_status(api: Api, farm: str) -> None:
     }  # fmt: skip
     assert told["time"] == "2030-12-31T23:00:00.000000Z"
     assert told["online"] is True
+    assert told["vouched"] is True
     assert told["lag"] == {"events": 0, "differs": False, "since": None}
     assert told["holds"] == {"version": 2, "root": root, "since": told["received"]}
     assert robot.get(f"robots?environment={farm}").json() == [told]

@@ -35,6 +35,25 @@ def farm(store: Store) -> Store:
     return store
 
 
+def test_authority_of_one_report_lasts(farm: Store):
+    def vouched() -> list[bool]:
+        return [r.vouched for r in farm.robots("farm")]
+
+    open_bus = {"vouched": False}
+    said = NOW
+    first, second = heard("r1", 0, A, said=said), heard("r1", 1, B, "ready", said=said)
+    farm.note_reports([replace(first, **open_bus), replace(second, **open_bus), replace(heard("r2", 0), **open_bus)])
+    assert vouched() == [False, False]
+    farm.note_reports([replace(first, time=NOW + timedelta(minutes=2))])
+    assert vouched() == [True, False], "the same report came late, over HTTP"
+    assert farm.robots("farm", "r1")[0].report.state == "ready"
+    farm.note_reports([replace(heard("r1", 3, A, "failed"), **open_bus), heard("r2", 3)])
+    assert vouched() == [True, True]
+    farm.forget_robot("farm", "r2")
+    farm.note_reports([replace(heard("r2", 4), **open_bus)])
+    assert vouched() == [True, False]
+
+
 def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
     said = NOW - timedelta(hours=5)
     assert farm.note_reports([heard("r1", 0, A, detail="ok\x00", sequence=4, said=said)]) == [None]
@@ -190,6 +209,10 @@ def test_convergence_is_proved(farm: Store):
     say("a", 20, old, "ready")
     ready = holding(farm.robots("farm"), planned, base, old)
     assert (ready.holding, ready.ready) == (1, 1)
+    report = Report("production", 1, old, "ready")
+    farm.note_reports([Heard("farm", "made-up", report, base + timedelta(seconds=21), vouched=False)])
+    ready = holding(farm.robots("farm"), planned, base, old)
+    assert (ready.total, ready.ready) == (2, 1), "it is listed, and does not count in the roll-out"
 
 
 def test_lag_counts_the_events_not_acted_on(sqlite_store: Store):
