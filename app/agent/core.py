@@ -585,13 +585,19 @@ class Agent:
         moment = datetime.fromtimestamp(self._clock(), UTC)
         now = moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
         detail = detail[: messages.MAX_DETAIL] if detail else None
-        status = RobotStatus(channel, version, root, state, detail, now, sequence)
+        status = RobotStatus(channel, version, root, state, detail, now, sequence, self._loaded(manifest))
         if _same(status, self._said):
             return
         self._said = status
         if detail is None:
             self._tell(state, version=version, root=root, channel=channel)
         self._send_status()
+
+    def _loaded(self, standing: Manifest | None) -> tuple[int, str] | None:
+        """Version and root that ``current`` points to, if the hooks have loaded it; None while they have not."""
+        if standing is None:
+            return 0, NO_ROOT
+        return (standing.version, standing.root) if self._state.activated == self._folder.standing else None
 
     def _fail(self, what: str, detail: str) -> None:
         self._tell(what, detail=detail)

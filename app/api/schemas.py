@@ -362,6 +362,13 @@ class ChannelBody(In):
         return value
 
 
+class StatusHoldsBody(In):
+    """A version that a robot has loaded."""
+
+    version: int = Field(ge=0, lt=2**63)
+    root: str = Field(pattern=r"^[0-9a-f]{64}$", description="64 zeros: it has no map.")
+
+
 class StatusBody(In):
     """What a robot says of itself."""
 
@@ -385,6 +392,9 @@ class StatusBody(In):
     detail: str | None = Field(None, max_length=2000)
     time: Moment | None = Field(None, description="RFC 3339 time with zone, by the robot's clock.")
     sequence: int | None = Field(None, ge=0, lt=2**63, description="Of the last event that it has processed.")
+    holds: StatusHoldsBody | None = Field(
+        None, description="What it has loaded, where the status is about another version; left out: as last reported."
+    )
 
 
 class OverlayBody(In):

@@ -45,7 +45,9 @@ def report_of(status: RobotStatus) -> Report:
         with contextlib.suppress(ValueError, OverflowError):
             said = datetime.fromisoformat(status.time)
             said = said.astimezone(UTC) if said.tzinfo is not None else None
-    return Report(status.channel, status.version, status.root, status.state, status.detail, status.sequence, said)
+    return Report(
+        status.channel, status.version, status.root, status.state, status.detail, status.sequence, said, status.holds
+    )
 
 
 @dataclass(frozen=True, slots=True)

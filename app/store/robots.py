@@ -13,7 +13,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from app.errors import Conflict, FleetMapError, Invalid, NotFound
 from app.store import tables
 from app.store.base import Base, clean, environment_row
-from app.store.values import LATEST, Heard, Held, Move, Report, Robot
+from app.store.values import LATEST, NO_ROOT, Heard, Held, Move, Report, Robot
 
 HISTORY: Final = 200
 """So many reports of each robot in each environment are kept."""
@@ -176,10 +176,7 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
     if not again:
         values["since"] = heard.time
     values["vouched"] = heard.vouched or (known is not None and known.vouched)
-    if report.state == "active":
-        same = known is not None and known.held_root == report.root
-        values |= {"held_version": report.version, "held_root": report.root, "held_sequence": report.sequence}
-        values["held_since"] = known.held_since if same and known is not None else heard.time
+    values |= _held_values(report, known, heard.time)
     if known is not None:
         connection.execute(update(table).where(*own).values(values))
     else:
@@ -194,6 +191,21 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
     if not again:
         _remember(connection, environment_id, heard, said)
     return None
+
+
+def _held_values(report: Report, known: Row[Any] | None, time: datetime) -> dict[str, Any]:
+    """What a robot runs, from its report: columns that change. Its own statement counts, whatever the report is about:
+    a status may be lost, so that a failure of the next version is the first that is received after a switch.
+    """
+    holds = (report.version, report.root) if report.state == "active" else report.holds
+    if holds is None:
+        return {}
+    version, root = holds
+    if root == NO_ROOT:
+        return dict.fromkeys(("held_version", "held_root", "held_sequence", "held_since"))
+    same = known is not None and known.held_root == root
+    since = known.held_since if same and known is not None else time
+    return {"held_version": version, "held_root": root, "held_sequence": report.sequence, "held_since": since}
 
 
 def _told_before(connection: Connection, environment_id: str, heard: Heard, said: dict[str, Any]) -> bool:

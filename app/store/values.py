@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -397,7 +397,11 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a robot says of itself. said: when, by its own clock. sequence: of the last event that it has processed."""
+    """What a robot says of itself. said: when, by its own clock. sequence: of the last event that it has processed.
+
+    holds: version and root that it has loaded, ``NO_ROOT`` for none; None where it does not say. It is not part of the
+    history.
+    """
 
     channel: str
     version: int
@@ -406,6 +410,7 @@ class Report:
     detail: str | None = None
     sequence: int | None = None
     said: datetime | None = None
+    holds: tuple[int, str] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -465,6 +470,9 @@ class Move:
     root: str
     time: datetime
 
+
+NO_ROOT: Final = "0" * 64
+"""Root that a robot without a map reports."""
 
 OverlayState = Literal["pending", "accepted", "rejected", "expired", "ended"]
 

@@ -211,6 +211,30 @@ def test_all_robots_hold_the_root(api: Api, farm: str) -> None:
     }  # fmt: skip
 
 
+def test_channel_counts_what_robots_hold(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/channels"
+
+    def stand() -> tuple[int, int, int]:
+        robots = next(c for c in api.get(url).json() if c["channel"] == "production")["robots"]
+        return robots["holding"], robots["lagging"], robots["failed"]
+
+    roots = {v: root_of(api, farm, v) for v in (1, 2, 3)}
+    held = {v: {"version": v, "root": roots[v]} for v in roots}
+    api("PUT", f"{url}/production", 200, json={"version": 2})
+    api("PUT", "robots/k/status", 200, json={**status(farm, roots[1]), "version": 1})
+    assert stand() == (0, 1, 0)
+    failed = {**status(farm, roots[3], "failed", holds=held[2]), "version": 3}
+    told = api("PUT", "robots/k/status", 200, json=failed).json()
+    assert (told["version"], told["state"], told["holds"]["version"]) == (3, "failed", 2)
+    assert stand() == (1, 0, 0), "it holds what the channel points to, and refused what comes next"
+    api("PUT", "robots/k/status", 200, json={**failed, "holds": held[1]})
+    assert stand() == (0, 0, 1)
+    api("PUT", "robots/k/status", 200, json={**failed, "holds": {"version": 0, "root": "0" * 64}})
+    assert api.get(f"robots/k?environment={farm}").json()["holds"] is None
+    for bad in ({"version": 1}, {"version": -1, "root": "0" * 64}, {"version": 1, "root": "x"}, 1):
+        api.problem("PUT", "robots/k/status", 422, json={**failed, "holds": bad})
+
+
 def test_a_rollout(api: Api, farm: str) -> None:
     url = f"environments/{farm}/channels/production"
 
