@@ -225,6 +225,13 @@ class Settings(BaseSettings):
         description="How long a signed manifest is good; a robot asks for a new one well before.",
     )
 
+    link_seconds: float = Field(
+        default=86_400.0,
+        ge=1,
+        le=2_592_000,
+        description="Maximum life of a signed link, which is also the default. A link needs no token until it expires.",
+    )
+
     max_upload_bytes: int = Field(
         default=_DEFAULTS.upload_bytes, ge=1, description="Largest upload: the sum of all files of one request."
     )

@@ -121,6 +121,14 @@ class Unauthenticated(Denied):
     """No token, or an unknown or expired one."""
 
 
+class InvalidLink(Denied):
+    """A signed link that was altered or never made here, or whose environment is deleted."""
+
+
+class ExpiredLink(Denied):
+    """A signed link whose time is over."""
+
+
 class Unavailable(FleetMapError):
     """Not now: too much work, a store that does not answer. Trying again later may help."""
 

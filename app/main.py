@@ -37,6 +37,7 @@ from app.api import (
     health,
     jobs,
     layers,
+    links,
     manifest,
     maps,
     openapi,
@@ -60,6 +61,7 @@ from app.api.maps import Hot, Server
 from app.api.metrics import Metrics
 from app.api.protocol import BoundedProtocol
 from app.api.services import ApiOptions, Services
+from app.api.signed import SignedLinks
 from app.api.uploads import Intake
 from app.config import Settings
 from app.convert import Maps
@@ -74,6 +76,7 @@ from app.events.security import Security
 from app.fleet import Intake as FleetIntake
 from app.fleet import decide
 from app.ingest import Ingest, Provider
+from app.links import LinkSecrets
 from app.pool import Pool
 from app.sandbox import Allowed
 from app.signing import Keys
@@ -135,6 +138,7 @@ def create_app(settings: Settings) -> Server:
         versions,
         layers,
         maps,
+        links,
         diff,
         changes,
         channels,
@@ -288,9 +292,20 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         intake=intake,
         metrics=metrics,
         keys=Keys(settings.data_dir / "keys"),
+        links=SignedLinks(
+            LinkSecrets(settings.data_dir / "keys"), access, store.environment, int(settings.link_seconds)
+        ),
         deltas=Deltas(service.cache),
-        fleet=FleetIntake(store),
+        fleet=FleetIntake(store, bus_vouches=_bus_vouches(settings)),
     )
+
+
+def _bus_vouches(settings: Settings) -> bool:
+    """Whether only known users reach the router, so that a robot's report on it is the robot's own.
+
+    Of another router all that is known is that the server itself had to log in. Without tokens everybody counts.
+    """
+    return settings.insecure_no_auth or settings.zenoh_users is not None or settings.zenoh_user is not None
 
 
 def provider_of(settings: Settings) -> Provider | None:

@@ -59,6 +59,9 @@ CONFIRM_SECONDS = 60.0
 confirms that he heard it. A fleet that changes at once does so spread over this time.
 """
 
+FIRST_CONFIRM_SECONDS = 2.0
+"""The same for the first status after the start."""
+
 AGAIN_SECONDS = 30.0
 """A robot without Zenoh repeats its status with the first sync after so long."""
 
@@ -123,6 +126,7 @@ class Agent:
         self._put_at = 0.0
         self._on_bus: RobotStatus | None = None
         self._confirm_at: float | None = None
+        self._confirmed = False
         self._target: tuple[int, str] | None = None
         self._activated: tuple[str | None, tuple[int, str] | None] | None = None
         self._told: set[str] = set()
@@ -581,13 +585,19 @@ class Agent:
         moment = datetime.fromtimestamp(self._clock(), UTC)
         now = moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
         detail = detail[: messages.MAX_DETAIL] if detail else None
-        status = RobotStatus(channel, version, root, state, detail, now, sequence)
+        status = RobotStatus(channel, version, root, state, detail, now, sequence, holds=self._loaded(manifest))
         if _same(status, self._said):
             return
         self._said = status
         if detail is None:
             self._tell(state, version=version, root=root, channel=channel)
         self._send_status()
+
+    def _loaded(self, standing: Manifest | None) -> tuple[int, str] | None:
+        """Version and root that ``current`` points to, if the hooks have loaded it; None while they have not."""
+        if standing is None:
+            return 0, NO_ROOT
+        return (standing.version, standing.root) if self._state.activated == self._folder.standing else None
 
     def _fail(self, what: str, detail: str) -> None:
         self._tell(what, detail=detail)
@@ -612,7 +622,9 @@ class Agent:
                 self._on_bus = status
             if _same(status, self._on_bus):
                 if self._confirm_at is None:
-                    self._confirm_at = now + CONFIRM_SECONDS * random.uniform(0.25, 1.0)  # noqa: S311
+                    # A robot counts in roll-outs only once it has reported with its token.
+                    share = random.uniform(0.25, 1.0)  # noqa: S311
+                    self._confirm_at = now + share * (CONFIRM_SECONDS if self._confirmed else FIRST_CONFIRM_SECONDS)
                 if now < self._confirm_at:
                     return
         self._confirm_at = now + CONFIRM_SECONDS  # where this try fails
@@ -622,7 +634,7 @@ class Agent:
             return
         except FleetMapError as error:
             self._tell_once("status", detail=f"the server does not take the robot's status: {error.detail}")
-        self._put, self._put_at, self._confirm_at = status, now, None
+        self._put, self._put_at, self._confirm_at, self._confirmed = status, now, None, True
 
     def _tell_once(self, what: str, **members: Any) -> None:
         if what not in self._told:

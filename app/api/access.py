@@ -162,6 +162,13 @@ class Access:
             self.forgotten += 1
             self._known.clear()
 
+    def note_guess(self, client: str | None) -> None:
+        """Count a signature that no secret made, like a wrong token. Throttled after too many from this address."""
+        source = source_of(client)
+        if self._failed(source) >= self._failures:
+            raise Throttled("too many wrong signatures or tokens came from your address: wait a minute")
+        self._note_failure(source)
+
     def _failed(self, source: str) -> int:
         with self._lock:
             times = self._sources.get(source)

@@ -11,6 +11,7 @@ import time
 from typing import Any
 from urllib.parse import urlsplit
 
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -19,6 +20,7 @@ from app.api.access import Principal, environment_of, is_open
 from app.api.answers import API
 from app.api.problems import MalformedBody, SlowBody, UnsupportedMedia
 from app.api.services import Services
+from app.api.signed import LINK, signed_address
 from app.api.together import Together
 from app.errors import Denied, FleetMapError, TooLarge
 
@@ -86,12 +88,7 @@ class Guard:
         if here.options.insecure_no_auth:
             _only_from_here(headers)
         if not is_open(scope["path"]):
-            authorization = headers.get(b"authorization")
-            principal = here.access.known(authorization)
-            if principal is None:
-                client = scope["client"][0] if scope.get("client") else None
-                key = (authorization, client, here.hot.generation())
-                principal = await self._checks.run(key, here.access.check, authorization, client)
+            principal = await self._principal(scope, headers, here)
             environment = environment_of(scope["path"])
             if environment is not None:
                 principal.enter(environment)
@@ -99,6 +96,20 @@ class Guard:
         if scope["method"] in _BODY and body.begin(scope, headers):
             await body.preload()
         await self._app(scope, body, answer)
+
+    async def _principal(self, scope: Scope, headers: dict[bytes, bytes], here: Services) -> Principal:
+        """The caller: by the link that the address is, else by the token. A token beside a link counts for nothing."""
+        client = scope["client"][0] if scope.get("client") else None
+        link = signed_address(scope)
+        if link is not None:
+            scope["state"][LINK] = link
+            return await run_in_threadpool(here.links.check, link, client)
+        authorization = headers.get(b"authorization")
+        principal = here.access.known(authorization)
+        if principal is None:
+            key = (authorization, client, here.hot.generation())
+            principal = await self._checks.run(key, here.access.check, authorization, client)
+        return principal
 
     async def _refuse(self, response: Any, scope: Scope, body: _Body, answer: _Answer) -> None:
         if answer.started:

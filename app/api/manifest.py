@@ -55,8 +55,12 @@ def list_keys(here: Here, _: Viewer) -> Response:
     "/keys", status_code=201, responses=told(KeyOut, ok=201, description="The new key"), summary="Rotate the key"
 )
 def rotate_key(here: Here, _: Admin) -> Response:
-    """From now on a new key signs. Robots that trust the old one follow, since it vouches for the new one."""
+    """From now on a new key signs. Robots that trust the old one follow, since it vouches for the new one.
+
+    Signed links get a new secret as well; links that were made before stay valid until they expire.
+    """
     made = here.keys.rotate()
+    here.links.rotate()
     here.store.generation.change()  # what was signed with the old key is in memory no longer
     return answer(made.as_dict(), 201)
 
@@ -282,17 +286,6 @@ def _entry(text: str, where: str, *, required: bool) -> _Entry:
     except Invalid as error:
         raise Invalid(f"{name}: {error.detail}", error.problems) from None
     return _Entry(name, values, derive, closures, required)
-
-
-async def made_for(
-    here: Services, version: Version, name: str, values: dict[str, str], request: Request, who: Any
-) -> Made | Started:
-    """A version's map in a format, with these options; the job where it takes long."""
-    while True:
-        recipe: Recipe = await run_in_threadpool(here.maps.recipe, version, name, values)
-        made = await run_in_threadpool(here.maps.ready, recipe) or await _made(here, recipe, request, who)
-        if made is not None:
-            return made
 
 
 async def _made(here: Services, recipe: Recipe, request: Request, who: Any) -> Made | Started | None:

@@ -33,11 +33,13 @@ from app.api.jobs import Started, started
 from app.api.metrics import Metrics
 from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, told
 from app.api.services import Here, Services
+from app.api.signed import LINK
 from app.api.together import Together
 from app.convert import Recipe
 from app.convert.cache import Made, MadeFile
 from app.convert.maps import file_of
-from app.errors import CannotDerive, Invalid, NotFound, Problem
+from app.errors import CannotDerive, Invalid, NotFound, Problem, Unavailable
+from app.links import SignedAddress
 from app.model.closures import CLOSURE_MODES, ClosureMode
 from app.store.values import LATEST, Version
 
@@ -73,7 +75,7 @@ class Wanted:
 @dataclass(frozen=True, slots=True, eq=False)
 class Resource:
     """What stands at an address. recipe: None where it is no map. body: None while it is not made, or too large for
-    memory; path: then its file.
+    memory; path: then its file. link_expires: seconds since 1970, of a signed link; None where a token is needed.
     """
 
     wanted: Wanted
@@ -89,6 +91,7 @@ class Resource:
     generation: int
     fresh_until: float
     tally: list[int]
+    link_expires: int | None = None
 
 
 class Hot:
@@ -115,7 +118,8 @@ class Hot:
         fresh = self.get(key)
         if fresh is not None and (fresh.body is not None or fresh.path is not None):
             return fresh
-        values, derive, closures = _options(key[1])
+        link = link_of(request)
+        values, derive, closures = _options(key[1] if link is None else link.query)
         wanted = replace(wanted_of(request), closures=closures)
         # Taken before anything is read: a commit in between makes this answer stale, never fresh.
         generation, until = self.generation(), time.monotonic() + FRESH_SECONDS
@@ -127,6 +131,8 @@ class Hot:
                 self._put(key, fresh)
                 return fresh
             empty = self._resource(wanted, recipe, values, derive, generation, until, _route(request))
+            if link is not None:
+                empty = _by_link(empty, link)
             if _matches(request, empty.etag):
                 self._put(key, empty)
                 return empty
@@ -230,6 +236,22 @@ class Hot:
             self._entries[key] = resource
             while self._size > self._limit and len(self._entries) > 1:
                 self._size -= _weight(self._entries.popitem(last=False)[1])
+
+
+def link_of(request: Request) -> SignedAddress | None:
+    """The signed link, already checked, that a request was made by."""
+    link: SignedAddress | None = request.scope["state"].get(LINK)
+    return link
+
+
+def _by_link(resource: Resource, link: SignedAddress) -> Resource:
+    """The same for a link: only its holder may cache it, and no page learns the link as a referrer."""
+
+    def private(headers: Headers) -> Headers:
+        others = [(name, value) for name, value in headers if name != b"cache-control"]
+        return [*others, (b"cache-control", b"private, no-cache"), (b"referrer-policy", b"no-referrer")]
+
+    return replace(resource, headers=private(resource.headers), bare=private(resource.bare), link_expires=link.expires)
 
 
 def _key(request: Request) -> Key:
@@ -336,8 +358,9 @@ def _route(request: Request) -> str:
 
 
 def address_of(request: Request) -> str:
-    """The request's own address, to be asked for again."""
-    query = request.url.query
+    """The request's own address, to be asked for again; without the signature of a link."""
+    link = link_of(request)
+    query = request.url.query if link is None else link.query.decode()
     return quote(request.scope["path"], safe="/") + (f"?{quote(query, safe='&=%,.:+-_~/')}" if query else "")
 
 
@@ -419,8 +442,11 @@ def _reply(
             condition = value
         elif name in (b"range", b"if-match", b"available-dictionary"):
             return None
-    who = hot.access.known(authorization)
-    if who is None or not who.may_enter(found.wanted.environment):
+    if found.link_expires is None:
+        who = hot.access.known(authorization)
+        if who is None or not who.may_enter(found.wanted.environment):
+            return None
+    elif found.link_expires <= time.time():  # the signature is part of the key: it was checked with the first request
         return None
     if hot.access.insecure and not is_from_here(dict(headers)):
         return None
@@ -443,6 +469,8 @@ async def download(template: str, request: Request) -> Response:
     who: Principal = request.scope["state"]["principal"]
     found = await here.hot.find(request, here, who)
     if isinstance(found, Started):
+        if link_of(request) is not None:  # its holder has no token to follow a job with
+            raise Unavailable("the map is still being converted: try again in a few seconds")
         return started(found.job)
     if none_match(request.headers.get("if-none-match"), found.etag):
         return _response(304, found.bare)
@@ -543,6 +571,37 @@ def add_routes(app: FastAPI) -> None:
         app.router.add_route(path, partial(download, path), methods=["GET"], include_in_schema=False)
 
 
+async def made_at(here: Services, wanted: Wanted, query: bytes, who: Principal) -> tuple[Recipe, Made] | Started:
+    """The map that an address of a version's number gives, made where need be; the job that makes it if it takes long.
+
+    query: the map's parameters, percent-encoded.
+    """
+    values, derive, closures = _options(query)
+    path = path_of("environments", wanted.environment, "versions", wanted.version, "maps", wanted.format)
+    address = f"{path}?{query.decode()}" if query else path
+    plan = partial(_resolve, here, replace(wanted, closures=closures), values, derive)
+    return await made_by(here, plan, address, who)
+
+
+async def made_by(
+    here: Services, plan: Callable[[], Recipe], address: str, who: Principal
+) -> tuple[Recipe, Made] | Started:
+    """The map of a recipe, made where need be; the job that makes it for ``address`` if it takes long.
+
+    plan: called again if a derivation finds nothing to use; the next recipe goes another way, or says there is none.
+    """
+    while True:
+        recipe = await run_in_threadpool(plan)
+        made = await run_in_threadpool(here.maps.ready, recipe)
+        if made is not None:
+            return recipe, made
+        try:
+            outcome = await here.work.make(recipe, who, address)
+        except CannotDerive:
+            continue
+        return outcome if isinstance(outcome, Started) else (recipe, outcome)
+
+
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=Route)
 
 
@@ -569,16 +628,8 @@ async def report(
 ) -> Response:
     """Raw, derived and filled-in information of a map, what was dropped and why. Takes the map's own parameters."""
     values, allowed, mode = _options(request.scope["query_string"])
-    wanted = Wanted(env, v, format, None, mode)
-    while True:
-        recipe = await run_in_threadpool(_resolve, here, wanted, values, allowed and derive)
-        if await run_in_threadpool(here.maps.ready, recipe) is not None:
-            break
-        try:
-            outcome = await here.work.make(recipe, who, address_of(request))
-        except CannotDerive:
-            continue
-        if isinstance(outcome, Started):
-            return started(outcome.job)
-        break
-    return answer(await run_in_threadpool(here.maps.report, recipe))
+    plan = partial(_resolve, here, Wanted(env, v, format, None, mode), values, allowed and derive)
+    outcome = await made_by(here, plan, address_of(request), who)
+    if isinstance(outcome, Started):
+        return started(outcome.job)
+    return answer(await run_in_threadpool(here.maps.report, outcome[0]))

@@ -34,9 +34,9 @@ All errors are `application/problem+json` (RFC 9457). Lists come in pages: the `
 Versions are named by number, by channel (`production`), or `latest`. Coordinates are `longitude, latitude` in GeoJSON
 and `latitude, longitude` in query parameters, as their names say.
 
-Access: `Authorization: Bearer <token>`. Roles: `viewer` and `robot` read, `robot` also tells
-the status of the robot that its token names and what is blocked; `editor` also uploads, edits, converts, moves
-channels and sets datums; `admin` does all.
+Access: `Authorization: Bearer <token>`; maps also by a signed link (`POST …/links`). Roles: `viewer` and `robot` read,
+`robot` also tells the status of the robot that its token names and what is blocked; `editor` also uploads, edits,
+converts, moves channels and sets datums; `admin` does all.
 """
 
 
@@ -100,7 +100,13 @@ def build(app: FastAPI) -> dict[str, Any]:
         schemas.update(shape.pop("$defs", {}))
         schemas[name] = shape
     components["securitySchemes"] = {
-        "token": {"type": "http", "scheme": "bearer", "description": "A token; see `/api/v1/tokens`."}
+        "token": {"type": "http", "scheme": "bearer", "description": "A token; see `/api/v1/tokens`."},
+        "link": {
+            "type": "apiKey",
+            "in": "query",
+            "name": "signature",
+            "description": "A signed link, used as it was given (with its `expires`); see `POST …/links`.",
+        },
     }
     _map_paths(schema["paths"])
     for path, operations in schema["paths"].items():
@@ -140,10 +146,11 @@ def _finish(path: str, operation: dict[str, Any]) -> None:
     responses = operation["responses"]
     common: dict[str, str] = {}
     if not is_open(path):
-        operation["security"] = [{"token": []}]
+        operation["security"] = [{"token": []}, *([{"link": []}] if _is_map(path) else [])]
         common |= {
             "401": "A token is needed, or it is unknown or has expired.",
-            "403": "The token's role or its environments do not allow it.",
+            "403": "The token's role or its environments do not allow it."
+            + (" Or the signed link was altered, or has expired." if _is_map(path) else ""),
             "429": "Too many wrong tokens from this address.",
         }
         common["422"] = "A parameter, the body or a file cannot be used; `errors` says where."
@@ -159,6 +166,10 @@ def _finish(path: str, operation: dict[str, Any]) -> None:
         known = responses.get(status)
         if known is None or "HTTPValidationError" in str(known):
             responses[status] = {"description": text, "content": problem}
+
+
+def _is_map(path: str) -> bool:
+    return path.startswith("/maps/") or "/maps/{format}" in path
 
 
 def _map_paths(paths: dict[str, Any]) -> None:

@@ -17,7 +17,7 @@ from starlette.responses import Response
 from app.api.access import Editor, Principal, Reporter, Viewer
 from app.api.answers import Route, answer
 from app.api.jobs import Started, started
-from app.api.manifest import made_for
+from app.api.maps import address_of, made_by
 from app.api.schemas import (
     DynamicEdgesOut,
     EnvironmentPath,
@@ -323,10 +323,11 @@ async def _marked(
     ended = [o for o in await run_in_threadpool(here.store.overlays, env) if o.state == "ended"]
     out = []
     for closures in (shown.closures, Closures(tuple(o.closure for o in ended), "mark")):
-        made = await made_for(here, live.with_closures(shown, closures), name, {}, request, who)
-        if isinstance(made, Started):
-            return made
-        out.append(await run_in_threadpool(_files, made))
+        plan = partial(here.maps.recipe, live.with_closures(shown, closures), name)
+        outcome = await made_by(here, plan, address_of(request), who)
+        if isinstance(outcome, Started):
+            return outcome
+        out.append(await run_in_threadpool(_files, outcome[1]))
     return out
 
 

@@ -73,6 +73,8 @@ STATUS: Mapping[type[errors.FleetMapError], tuple[int, str]] = {
     Throttled: (429, "Too many failures"),
     errors.Denied: (403, "Denied"),
     errors.Unauthenticated: (401, "Token needed"),
+    errors.InvalidLink: (403, "Invalid link"),
+    errors.ExpiredLink: (403, "Expired link"),
     errors.Unavailable: (503, "Unavailable"),
     errors.Damaged: (500, "Damaged data"),
     errors.Untrusted: (500, "Not to be trusted"),

@@ -90,9 +90,9 @@ async def put_status(
     who.enter(body.environment)
     if body.time is not None and body.time.tzinfo is None:
         raise Invalid("time needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="body.time")])
-    report = Report(
-        body.channel, body.version, body.root, body.state, body.detail, body.sequence, body.time, body.overlays
-    )
+    holds = None if body.holds is None else (body.holds.version, body.holds.root)
+    more = (body.detail, body.sequence, body.time, body.overlays, holds)
+    report = Report(body.channel, body.version, body.root, body.state, *more)
     # No thread waits for the store: a whole fleet reports at once, and others want maps meanwhile.
     noting = here.fleet.noting(Heard(body.environment, robot, report, datetime.now(UTC)))
     await asyncio.wait({asyncio.wrap_future(noting)}, timeout=fleet.NOTE_SECONDS)
@@ -165,6 +165,7 @@ def _told(here: Services, robots: Sequence[Robot]) -> list[dict[str, Any]]:
             "since": rfc3339(robot.since),
             "holds": held and _held(held),
             "online": fleet.is_online(robot, now),
+            "vouched": robot.vouched,
             "lag": lag,
         }
         out.append(body)

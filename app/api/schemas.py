@@ -363,6 +363,13 @@ class ChannelBody(In):
         return value
 
 
+class StatusHoldsBody(In):
+    """A version that a robot has loaded."""
+
+    version: int = Field(ge=0, lt=2**63)
+    root: str = Field(pattern=r"^[0-9a-f]{64}$", description="64 zeros: it has no map.")
+
+
 class StatusBody(In):
     """What a robot says of itself."""
 
@@ -387,7 +394,10 @@ class StatusBody(In):
     time: Moment | None = Field(None, description="RFC 3339 time with zone, by the robot's clock.")
     sequence: int | None = Field(None, ge=0, lt=2**63, description="Of the last event that it has processed.")
     overlays: str | None = Field(
-        None, pattern=r"^[0-9a-f]{64}$", description="Digest of the closures in its map, as the manifest gives it."
+        None, pattern=r"^[0-9a-f]{64}$", description="Digest of the closures in the map that it has loaded."
+    )
+    holds: StatusHoldsBody | None = Field(
+        None, description="What it has loaded, where the status is about another version; left out: as last reported."
     )
 
 
@@ -435,6 +445,27 @@ class OverlayBody(In):
     detail: str | None = Field(None, max_length=2000)
 
 
+class LinkBody(In):
+    """The map, or one file of it, that a signed link gives."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        allow_inf_nan=False,
+        json_schema_extra={"examples": [{"format": "geojson", "file": "map.geojson", "seconds": 3600}]},
+    )
+
+    format: str = Field(max_length=64, description="A format's id.")
+    file: str | None = Field(
+        None, min_length=1, max_length=1000, description="One file of the map; left out: the file itself or a zip."
+    )
+    parameters: dict[str, str | int | float | bool] = Field(
+        default_factory=dict, max_length=50, description="Parameters of the map, as in its address."
+    )
+    seconds: int | None = Field(
+        None, ge=1, description="Life of the link. Default and maximum: the setting `FLEETMAP_LINK_SECONDS`."
+    )
+
+
 class TokenBody(In):
     """A new token."""
 
@@ -451,7 +482,12 @@ class TokenBody(In):
     environments: str | None = Field(
         None, min_length=1, max_length=200, description="Name pattern (`farm-*`) of the environments it reaches."
     )
-    robot: str | None = Field(None, min_length=1, max_length=200, description="The robot whose status it may set.")
+    robot: str | None = Field(
+        None,
+        min_length=1,
+        max_length=200,
+        description="Role `robot`: the robot whose status it may set. Default: `name`.",
+    )
     expires: Moment | None = Field(None, description="RFC 3339 time with zone; left out: never.")
 
 
@@ -643,7 +679,7 @@ class ChannelRobotsOut(BaseModel):
     holding: int
     lagging: int
     failed: int
-    ready: int
+    ready: int = Field(description="Those that have the planned version and count in its roll-out (`vouched`).")
     since: datetime | None
 
 
@@ -723,6 +759,10 @@ class RobotOut(BaseModel):
     since: datetime
     holds: HoldsOut | None
     online: bool
+    vouched: bool = Field(
+        description="Whether a report came with authority (by a token that may report for it, or over a router with "
+        "users). Other robots do not count in roll-outs."
+    )
     lag: LagOut | None
 
 
@@ -879,6 +919,18 @@ class NewTokenOut(TokenOut):
     token: str
 
 
+class LinkOut(BaseModel):
+    """A signed link, and the file that it gives."""
+
+    url: str = Field(description="Needs no token until it expires. Whoever has it can read this map.")
+    expires: datetime
+    version: int
+    root: str
+    name: str = Field(description="Of the file.")
+    size: int = Field(description="Bytes.")
+    sha256: str
+
+
 class DiffOut(BaseModel):
     """What differs between two versions."""
 
@@ -946,20 +998,36 @@ class ZoneSetsOut(BaseModel):
     closed_edges: list[dict[str, Any]] = Field(alias="closedEdges")
 
 
-class ActionsOut(BaseModel):
-    """Instant actions of VDA 5050 for one version."""
+class FloorActionsOut(BaseModel):
+    """Instant actions of VDA 5050 for one floor of a version."""
 
     model_config = ConfigDict(populate_by_name=True)
 
     map_id: str = Field(alias="mapId")
     map_version: str = Field(alias="mapVersion")
-    environment: str
-    version: int
-    root: str
+    level: str | None = Field(description="Null where no level was named.")
     size: int = Field(description="Bytes behind the link.")
+    expires: datetime | None = Field(description="End of the link; null where it needs a token.")
     download_map: dict[str, Any] = Field(alias="downloadMap")
     enable_map: dict[str, Any] = Field(alias="enableMap")
     delete_map: dict[str, Any] = Field(alias="deleteMap")
+
+
+class MissingLevelOut(BaseModel):
+    """A level without such a map, and why."""
+
+    level: str
+    detail: str
+
+
+class ActionsOut(FloorActionsOut):
+    """Instant actions of VDA 5050 for one version: of its first floor, and in ``maps`` of each."""
+
+    environment: str
+    version: int
+    root: str
+    maps: list[FloorActionsOut]
+    missing: list[MissingLevelOut] = Field(description="With `level=*`: levels that have no such map.")
 
 
 class StateOut(BaseModel):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from fastapi import Depends, Request
 
 from app.api.access import Access
+from app.api.signed import SignedLinks
 from app.convert import Maps
 from app.fleet import Intake as FleetIntake
 from app.formats import Limits
@@ -58,6 +59,7 @@ class Services:
     intake: Intake
     metrics: Metrics
     keys: Keys
+    links: SignedLinks
     deltas: Deltas
     fleet: FleetIntake
 

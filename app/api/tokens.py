@@ -13,6 +13,7 @@ from app.api.answers import Route, answer
 from app.api.schemas import NewTokenOut, TokenBody, TokenOut, TokenPath, told
 from app.api.services import Here
 from app.errors import Conflict, Invalid, NotFound, Problem
+from app.events.messages import ROBOT_NAME
 from app.store.values import Token, rfc3339
 
 router = APIRouter(prefix="/tokens", tags=["tokens"], route_class=Route)
@@ -45,7 +46,10 @@ def list_tokens(here: Here, who: Admin) -> Response:
     summary="Make a token",
 )
 def create_token(body: TokenBody, here: Here, who: Admin) -> Response:
-    """Its secret stands in this answer and nowhere else: only its hash is stored."""
+    """Its secret stands in this answer and nowhere else: only its hash is stored.
+
+    A token with the role `robot` names its robot: `robot`, by default its own `name`.
+    """
     who.demand_everywhere()
     if body.expires is not None:
         if body.expires.tzinfo is None:
@@ -54,8 +58,24 @@ def create_token(body: TokenBody, here: Here, who: Admin) -> Response:
             raise Invalid("expires is in the past", [Problem("past", where="expires")])
     if body.robot is not None and body.role != "robot":
         raise Invalid("only a token with the role robot names a robot", [Problem("role is not robot", where="robot")])
-    token, secret = here.store.create_token(body.name, body.role, body.environments, body.robot, body.expires)
+    robot = _robot_of(body)
+    token, secret = here.store.create_token(body.name, body.role, body.environments, robot, body.expires)
     return answer({**as_dict(token), "token": secret}, 201, {"cache-control": "no-store"})
+
+
+def _robot_of(body: TokenBody) -> str | None:
+    """The robot that a token names; None for other roles than ``robot``."""
+    if body.role != "robot":
+        return None
+    name = body.name if body.robot is None else body.robot
+    if not ROBOT_NAME.fullmatch(name):
+        rule = "at most 128 of A-Z, a-z, 0-9, _, . and -, starting with a letter or digit"
+        where = "name" if body.robot is None else "robot"
+        raise Invalid(
+            f"{name[:80]!r} is no robot's name, which must be {rule}: set 'robot' (on the command line --robot)",
+            [Problem(f"must be {rule}", where=where)],
+        )
+    return name
 
 
 @router.delete("/{id}", status_code=204, responses=told(None, 404, 409), summary="Revoke a token")

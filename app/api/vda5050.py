@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import secrets
 from typing import Annotated, Any
 
@@ -11,16 +12,17 @@ from starlette.responses import Response
 
 from app import formats
 from app.api.access import Principal, Reporter, Viewer
-from app.api.answers import Route, answer, path_of
+from app.api.answers import Route, answer
 from app.api.jobs import Started, started
-from app.api.manifest import made_for
+from app.api.links import LinkedFile, link_to
 from app.api.maps import number_of
 from app.api.robots import may_report, noted
 from app.api.schemas import CHANNEL, NAME, ActionsOut, EnvironmentPath, RobotPath, StateOut, VersionPath, told
 from app.api.services import Here, Services
-from app.errors import Invalid, NotFound, Problem
+from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.fleet import vda5050
-from app.store.values import Channel, Report, RobotState
+from app.model.frame import GROUND
+from app.store.values import Channel, Report, RobotState, Version
 
 router = APIRouter(tags=["vda5050"], route_class=Route)
 
@@ -53,41 +55,126 @@ async def get_actions(
         ),
     ] = None,
     format: Annotated[
-        str, Query(max_length=64, description="The format that the vehicles read.", examples=["geojson"])
+        str,
+        Query(
+            max_length=64,
+            description="The format that the vehicles read: any but `lif`, which is for fleet managers.",
+            examples=["geojson"],
+        ),
     ] = "occupancy_grid",
+    level: Annotated[
+        str | None,
+        Query(
+            min_length=1,
+            max_length=256,
+            description="A level's name, or `*` for one map of each level that has one. Default: the default level. "
+            "Only for formats with a parameter `level`.",
+        ),
+    ] = None,
+    signed: Annotated[
+        bool, Query(description="Whether the links need no token until they expire. `false`: they need one.")
+    ] = True,
+    seconds: Annotated[
+        int | None, Query(ge=1, description="Life of the links. Default and maximum: `FLEETMAP_LINK_SECONDS`.")
+    ] = None,
 ) -> Response:
     """`downloadMap` with the link to one file (a zip where the format has several) and its SHA-256, `enableMap`,
     `deleteMap`: to be sent as `instantActions` by the fleet manager. Further query parameters are the map's.
 
-    `mapVersion` is the version's number, and the link names it, so that its bytes stay the same whatever is promoted
-    later. A vehicle needs a token to follow it. Each answer has new action ids.
+    VDA 5050 has a `mapId` for each floor: `mapId` itself is the default level, `<mapId>/<level>` another one. `maps`
+    has the actions of each floor that was asked for; the members beside it are those of the first. `mapVersion` is the
+    version's number, and the link names it, so that its bytes stay the same whatever is promoted later. Each answer
+    has new action ids.
     """
-    values = {k: t for k, t in request.query_params.multi_items() if k not in ("mapId", "format")}
+    own = {"mapId", "format", "level", "signed", "seconds"}
+    values = {name: text for name, text in request.query_params.multi_items() if name not in own}
     version = await run_in_threadpool(here.store.version, env, number_of(v))
-    if formats.get_format(format).write is None:
-        raise Invalid(f"{format} is not served", [Problem("not served", where="format")])
-    outcome = await made_for(here, version, format, values, request, who)
-    if isinstance(outcome, Started):
-        return started(outcome.job)
-    file = outcome.whole()
-    path = path_of("environments", env, "versions", version.number, "maps", format)
-    link = str(request.base_url.replace(path=path).include_query_params(**values))
-    name = map_id or env
-    unique = secrets.token_hex(8)
-    body = {
-        "mapId": name,
-        "mapVersion": str(version.number),
-        "environment": env,
-        "version": version.number,
-        "root": version.root,
-        "size": file.size,
+    _check_format(format, by_level=level is not None)
+    here.links.check_life(seconds)
+    maps: list[dict[str, Any]] = []
+    missing: list[dict[str, str]] = []
+    site = map_id or env
+    for name in _levels(version, level):
+        wanted = values if level is None else {**values, "level": name}
+        try:
+            outcome = await link_to(here, request, who, version, format, None, wanted, seconds, signed=signed)
+        except (NotFound, CannotConvert) as error:
+            if level != "*":
+                raise
+            missing.append({"level": name, "detail": error.detail})
+            continue
+        if isinstance(outcome, Started):
+            return started(outcome.job)
+        floor = map_id if map_id is not None and level != "*" else vda5050.map_id_of(site, _other(version, name))
+        maps.append(_actions(version, floor, name if level is not None else None, outcome))
+    if not maps:
+        raise CannotConvert("no level has this map: " + "; ".join(f"{m['level']}: {m['detail']}" for m in missing[:20]))
+    body = {"environment": env, "version": version.number, "root": version.root, **maps[0], "maps": maps}
+    return answer(body | {"missing": missing}, headers={"cache-control": "no-store"})
+
+
+def _check_format(name: str, *, by_level: bool) -> None:
+    """Invalid for what no vehicle reads, and for a level of a format that has all of them in one map."""
+    if name == "lif":
+        raise Invalid(
+            "lif is a layout for the fleet manager, never for vehicles: give them occupancy_grid or nav2_route, or the "
+            "format that they read, and fetch lif from .../maps/lif for the fleet manager itself",
+            [Problem("not for vehicles", where="format")],
+        )
+    fmt = formats.get_format(name)
+    if fmt.write is None:
+        raise Invalid(f"{name} is not served", [Problem("not served", where="format")])
+    if by_level and not _has_level(fmt):
+        others = ", ".join(f.name for f in formats.all_formats().values() if f.write is not None and _has_level(f))
+        raise Invalid(
+            f"a map in {name} holds all levels: leave out level, or use one of {others}",
+            [Problem("the format has no levels", where="level")],
+        )
+
+
+def _has_level(fmt: formats.Format) -> bool:
+    return any(field.name == "level" for field in dataclasses.fields(fmt.write_options))
+
+
+def _default_level(version: Version) -> str:
+    """``ground``, else the lowest level."""
+    names = [level.name for level in version.levels]
+    if not names or GROUND in names:
+        return GROUND
+    return min(version.levels, key=lambda level: level.elevation).name
+
+
+def _levels(version: Version, level: str | None) -> list[str]:
+    """The levels that are asked for, the default one first. NotFound for one that the version does not have."""
+    default = _default_level(version)
+    names = [default, *(other.name for other in version.levels if other.name != default)]
+    if level == "*":
+        return names
+    if level is not None and level not in names:
+        raise NotFound(f"version {version.number} has no level {level[:80]!r}; its levels are: {', '.join(names[:50])}")
+    return [level or default]
+
+
+def _other(version: Version, level: str) -> str | None:
+    """The level's name where it is not the default one."""
+    return None if level == _default_level(version) else level
+
+
+def _actions(version: Version, map_id: str, level: str | None, link: LinkedFile) -> dict[str, Any]:
+    """The three actions of one floor."""
+    unique, number = secrets.token_hex(8), version.number
+    return {
+        "mapId": map_id,
+        "mapVersion": str(number),
+        "level": level,
+        "size": link.file.size,
+        "expires": link.expires,
         "downloadMap": vda5050.action(
-            "downloadMap", name, version.number, unique, mapDownloadLink=link, mapHash=file.sha256
+            "downloadMap", map_id, number, unique, mapDownloadLink=link.url, mapHash=link.file.sha256
         ),
-        "enableMap": vda5050.action("enableMap", name, version.number, unique),
-        "deleteMap": vda5050.action("deleteMap", name, version.number, unique),
+        "enableMap": vda5050.action("enableMap", map_id, number, unique),
+        "deleteMap": vda5050.action("deleteMap", map_id, number, unique),
     }
-    return answer(body, headers={"cache-control": "no-store"})
 
 
 @router.post(
@@ -113,16 +200,23 @@ def post_state(
 ) -> Response:
     """Its `maps` become the robot's status, `mapVersion` being a version's number: ENABLED is `active`; a version that
     is planned for its channel and DISABLED is `ready`; an action of ours that failed is `failed`. All else in the
-    message is the fleet manager's. `ignored`: what is not known here, and why.
+    message is the fleet manager's.
+
+    The floors of a site (`<mapId>/<level>`) count together: the vehicle is `ready` with a version when it has it for
+    each floor in the message, and `active` with the oldest that is enabled on any. `ignored`: what is not known here,
+    and why.
     """
     may_report(who, robot)
     out: dict[str, list[dict[str, Any]]] = {"robots": [], "ignored": []}
-    found = [maps for maps in vda5050.read_state(message) if map_id in (None, maps.map_id)]
-    if environment is not None and len(found) > 1:
-        names = ", ".join(maps.map_id for maps in found[:20])
+    sites: dict[str, list[vda5050.Maps]] = {}
+    for maps in vda5050.read_state(message):
+        if map_id in (None, maps.map_id, vda5050.site_of(maps.map_id)):
+            sites.setdefault(vda5050.site_of(maps.map_id), []).append(maps)
+    if environment is not None and len(sites) > 1:
+        names = ", ".join(list(sites)[:20])
         raise Invalid(f"the state tells of several maps: say which is {environment}'s, mapId being one of {names}")
-    for maps in found:
-        _take(here, who, robot, maps, environment or maps.map_id, channel, out)
+    for site, floors in sites.items():
+        _take(here, who, robot, floors, environment or site, channel, out)
     return answer(out)
 
 
@@ -130,7 +224,7 @@ def _take(
     here: Services,
     who: Principal,
     robot: str,
-    maps: vda5050.Maps,
+    floors: list[vda5050.Maps],
     env: str,
     channel: str | None,
     out: dict[str, list[dict[str, Any]]],
@@ -141,8 +235,9 @@ def _take(
         known = next(iter(here.store.robots(env, robot)), None)
         channels = {c.name: c for c in here.store.channels(env)}
     except NotFound as error:
-        out["ignored"].append({"mapId": maps.map_id, "why": error.detail})
+        out["ignored"] += [{"mapId": floor.map_id, "why": error.detail} for floor in floors]
         return
+    maps = vda5050.whole_site(floors)
     usual = known.report.channel if known else "production" if "production" in channels else "latest"
     follows = channels.get(channel or usual)
     reports = [report for state, text, detail in _states(maps, follows) for report in _report(

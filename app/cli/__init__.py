@@ -87,6 +87,7 @@ def build(*, all_flags: bool = True) -> typer.Typer:
     for name, function in (
         ("import", maps.import_maps),
         ("export", maps.export_map),
+        ("link", maps.link),
         ("convert", maps.convert),
         ("check", maps.check),
         ("formats", maps.list_formats),

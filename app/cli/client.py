@@ -147,6 +147,14 @@ class Client:
         headers = {"Idempotency-Key": secrets.token_hex(16)} if repeat else {}
         return self._json(self._send("POST", path, json=_present(body), headers=headers, repeat=repeat))
 
+    def post_until_done(self, path: str, body: Mapping[str, Any]) -> Any:
+        """Send JSON that may be sent again; where it becomes a job, wait for its end with a bar and send it again."""
+        while True:
+            answer = self._send("POST", path, json=_present(body), repeat=True)
+            if answer.status_code != httpx.codes.ACCEPTED:
+                return self._json(answer)
+            self._wait(answer)
+
     def put(self, path: str, body: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> Any:
         """Put JSON."""
         return self._json(self._send("PUT", path, json=_present(body), headers=headers, repeat=True))

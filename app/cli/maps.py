@@ -111,6 +111,40 @@ def export_map(
     show_report(report)
 
 
+def link(
+    environment: Annotated[str, typer.Argument(help="Name of the environment.")],
+    format: Annotated[str, typer.Argument(help="Format wanted; `fleetmap formats` lists them.")],
+    file: Annotated[str | None, typer.Argument(help="Only this file of the map [default: the whole map].")] = None,
+    version: Annotated[
+        str | None,
+        typer.Option("--version", "-V", help="Number or channel [default: production if there is one, else latest]."),
+    ] = None,
+    seconds: Annotated[
+        int | None, typer.Option("--seconds", min=1, help="Life of the link [default: the server's maximum, 24 h].")
+    ] = None,
+    option: options.Options = None,
+    derive: Annotated[bool, typer.Option("--derive/--no-derive", help="Derive layers that no source has told.")] = True,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Create a signed link to a map: an address that needs no token until it expires.
+
+    It names the version by number, so that it always gives the same bytes. Whoever has the link can read this map.
+    """
+    parameters: dict[str, str] = options.pairs(option)
+    parameters |= {} if derive else {"derive": "false"}
+    body: dict[str, Any] = {"format": format, "file": file, "parameters": parameters, "seconds": seconds}
+    with Client(server, token) as client:
+        chosen = version or _preferred(client, environment)
+        made = client.post_until_done(path_of("environments", environment, "versions", chosen, "links"), body)
+    if as_json:
+        output.show_json(made)
+        return
+    output.say(f"{made['name']} of version {made['version']}, without a token until {made['expires']}:")
+    output.show(made["url"])
+
+
 def convert(
     paths: Annotated[list[Path], typer.Argument(metavar="IN...", help="Map files, or a folder.", exists=True)],
     to: Annotated[str, typer.Option("--to", help="Format wanted; `fleetmap formats` lists them.")],

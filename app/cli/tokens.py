@@ -20,7 +20,8 @@ def create(
         str | None, typer.Option("--environments", "-e", help="Only environments of this name pattern: 'farm-*'.")
     ] = None,
     robot: Annotated[
-        str | None, typer.Option("--robot", help="The robot whose status it may set (role robot).")
+        str | None,
+        typer.Option("--robot", help="The robot whose status it may set (role robot) [default: the token's name]."),
     ] = None,
     expires: Annotated[str | None, typer.Option("--expires", metavar="TIME", help="Until when (RFC 3339).")] = None,
     server: options.Server = None,
@@ -34,7 +35,8 @@ def create(
     if as_json:
         output.show_json(made)
         return
-    output.say(f"token {made['id']} for {name} ({role}), shown only this once:")
+    scope = f"{role}, sets the status of the robot {made['robot']}" if made.get("robot") else role
+    output.say(f"token {made['id']} for {name} ({scope}), shown only this once:")
     output.show(made["token"])
 
 

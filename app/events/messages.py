@@ -98,7 +98,11 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """A robot's report of itself. time: RFC 3339, by the robot's clock. overlays: digest of the closures in its map."""
+    """A robot's report of itself. time: RFC 3339, by the robot's clock.
+
+    holds: version and root that the robot's ``current`` points to and that it has loaded, whatever the state is about;
+    the root ``NO_ROOT`` for none; None if it does not say. overlays: digest of the closures in that map.
+    """
 
     channel: str
     version: int
@@ -108,6 +112,7 @@ class RobotStatus:
     time: str | None = None
     sequence: int | None = None
     overlays: str | None = None
+    holds: tuple[int, str] | None = None
 
     @classmethod
     def from_json(cls, data: bytes | str) -> RobotStatus:
@@ -134,21 +139,21 @@ class RobotStatus:
         channel, version, root = body.get("channel"), body.get("version"), body.get("root")
         state, detail, time = body.get("state"), body.get("detail"), body.get("time")
         sequence, overlays = body.get("sequence"), body.get("overlays")
-        whole = isinstance(version, int) and not isinstance(version, bool) and 0 <= version < 2**63
         check("channel", isinstance(channel, str) and _CHANNEL.fullmatch(channel) is not None, "a channel's name")
-        check("version", whole, "a version's number")
+        check("version", _is_number(version), "a version's number")
         check("root", isinstance(root, str) and _ROOT.fullmatch(root) is not None, "64 hexadecimal digits")
         check("state", state in ROBOT_STATES, " or ".join(ROBOT_STATES))
         check("detail", detail is None or (isinstance(detail, str) and len(detail) <= MAX_DETAIL), "a short text")
         check("time", time is None or (isinstance(time, str) and len(time) <= 64), "an RFC 3339 time")
-        numbered = isinstance(sequence, int) and not isinstance(sequence, bool) and 0 <= sequence < 2**63
-        check("sequence", sequence is None or numbered, "an event's number")
+        check("sequence", sequence is None or _is_number(sequence), "an event's number")
         hashed = isinstance(overlays, str) and _ROOT.fullmatch(overlays) is not None
         check("overlays", overlays is None or hashed, "64 hexadecimal digits")
+        holds = _read_holds(body.get("holds"))
+        check("holds", (body.get("holds") is None) == (holds is None), "a version and its root")
         if problems:
             raise Invalid("; ".join(f"{p.where} {p.problem}" for p in problems), problems)
         known = next(s for s in ROBOT_STATES if s == state)
-        return cls(str(channel), int(version or 0), str(root), known, detail, time, sequence, overlays)
+        return cls(str(channel), int(version or 0), str(root), known, detail, time, sequence, overlays, holds)
 
     def as_dict(self) -> dict[str, Any]:
         """The status without its empty members."""
@@ -161,8 +166,23 @@ class RobotStatus:
             "time": self.time,
             "sequence": self.sequence,
             "overlays": self.overlays,
+            "holds": None if self.holds is None else {"version": self.holds[0], "root": self.holds[1]},
         }
         return {name: value for name, value in members.items() if value is not None}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
+
+
+def _read_holds(value: Any) -> tuple[int, str] | None:
+    """The member ``holds``; None where it is none."""
+    if not isinstance(value, Mapping):
+        return None
+    version, root = value.get("version"), value.get("root")
+    if not _is_number(version) or not isinstance(root, str) or _ROOT.fullmatch(root) is None:
+        return None
+    return int(version or 0), root
 
 
 def dumps(value: Mapping[str, Any]) -> bytes:

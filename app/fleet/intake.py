@@ -45,8 +45,8 @@ def report_of(status: RobotStatus) -> Report:
         with contextlib.suppress(ValueError, OverflowError):
             said = datetime.fromisoformat(status.time)
             said = said.astimezone(UTC) if said.tzinfo is not None else None
-    numbered = (status.sequence, said, status.overlays)
-    return Report(status.channel, status.version, status.root, status.state, status.detail, *numbered)
+    more = (status.sequence, said, status.overlays, status.holds)
+    return Report(status.channel, status.version, status.root, status.state, status.detail, *more)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +58,15 @@ class _Said:
 
 
 class Intake:
-    """Reports and liveliness. ``heard`` and ``alive`` return at once, ``note`` when it is stored; a thread writes."""
+    """Reports and liveliness. ``heard`` and ``alive`` return at once, ``note`` when it is stored; a thread writes.
 
-    def __init__(self, store: Store, clock: Callable[[], datetime] = lambda: datetime.now(UTC)) -> None:
-        self._store, self._clock = store, clock
+    bus_vouches: whether reports over the bus come with authority, because its router lets nobody in but its users.
+    """
+
+    def __init__(
+        self, store: Store, clock: Callable[[], datetime] = lambda: datetime.now(UTC), *, bus_vouches: bool = False
+    ) -> None:
+        self._store, self._clock, self._bus_vouches = store, clock, bus_vouches
         self._queue: queue.Queue[tuple[str, str, bytes, datetime] | _Said | None] = queue.Queue(WAITING)
         self._shares: Counter[str] = Counter()
         self._there: set[str] = set()
@@ -176,7 +181,7 @@ class Intake:
                 if not self._shares[robot]:
                     del self._shares[robot]
             try:
-                out.append(_Said(_read(environment, robot, payload, came)))
+                out.append(_Said(_read(environment, robot, payload, came, vouched=self._bus_vouches)))
             except FleetMapError as error:
                 refused.append(f"a report of {robot!r:.128} in {environment!r:.64} was left out: {error.detail}")
         _warn(refused)
@@ -242,7 +247,7 @@ def _warn(reasons: list[str]) -> None:
         log.warning("%s%s", reasons[0], f" (and {len(reasons) - 1} others)" if len(reasons) > 1 else "")
 
 
-def _read(environment: str, robot: str, payload: bytes, time: datetime) -> Heard:
+def _read(environment: str, robot: str, payload: bytes, time: datetime, *, vouched: bool) -> Heard:
     if not ROBOT_NAME.fullmatch(robot) or not ENVIRONMENT_NAME.fullmatch(environment):
         raise Invalid("a robot's or environment's name cannot be used")
-    return Heard(environment, robot, report_of(RobotStatus.from_json(payload)), time)
+    return Heard(environment, robot, report_of(RobotStatus.from_json(payload)), time, vouched)

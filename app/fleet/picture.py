@@ -72,7 +72,8 @@ class Holding:
     """How a channel's robots stand: each is one of holding, failed and lagging.
 
     holding: drive on the channel's root with the closures in force. failed: do not, and say that they failed. ready:
-    have the version that is planned. since: from when on all of them hold the root; None while any does not.
+    have the version that is planned, and count in its roll-out (vouched for). since: from when on all of them hold the
+    root; None while any does not.
     """
 
     total: int
@@ -119,6 +120,6 @@ def holding(robots: Iterable[Robot], channel: Channel, now: datetime, planned: s
         holding=len(hold),
         lagging=len(behind) - failed,
         failed=failed,
-        ready=0 if planned is None else sum(is_ready(robot, planned) for robot in own),
+        ready=0 if planned is None else sum(robot.vouched and is_ready(robot, planned) for robot in own),
         since=max([*hold, channel.time]) if own and not behind else None,
     )

@@ -2,7 +2,8 @@
 many fail.
 
 Shares are of the channel's robots that are online. Robots that say that they failed count as well where they are not
-online any more: what broke them may have been the map. What was said before a stage began does not count in it; that is
+online any more: what broke them may have been the map. Robots of which no report came with authority do not count:
+anybody can make them up on an open router. What was said before a stage began does not count in it; that is
 known from what was stored then, so that a clock that is set back hides no failure.
 """
 
@@ -17,7 +18,8 @@ from app.store.values import Robot, Rollout, Step, rfc3339
 
 
 def decide(rollout: Rollout, robots: Sequence[Robot], now: datetime) -> Step | None:
-    """The next step of a roll-out, None for waiting on. robots: of its channel."""
+    """The next step of a roll-out, None for waiting on. robots: of its channel; only those vouched for count."""
+    robots = [robot for robot in robots if robot.vouched]
     begun = rollout.started if rollout.moved is None else rollout.moved
     failed = [r for r in robots if r.failed_with(rollout.root)]
     names = {r.robot for r in failed if rollout.said_before.get(r.robot) != rfc3339(r.time)}

@@ -49,6 +49,39 @@ class Maps:
     failed: tuple[tuple[str, str], ...]
 
 
+def map_id_of(site: str, level: str | None) -> str:
+    """The ``mapId`` of a floor: VDA 5050 has one for each. level: None for the default level, which is the site's."""
+    return site if level is None else f"{site}/{level}"
+
+
+def site_of(map_id: str) -> str:
+    """The site that a floor's ``mapId`` belongs to: the part before the first slash."""
+    return map_id.partition("/")[0]
+
+
+def whole_site(floors: Sequence[Maps]) -> Maps:
+    """What a vehicle holds of a site, from what its state says of each floor.
+
+    It runs the oldest version that is enabled on a floor, has those that it has of every floor that it reports, and
+    has failed with those that failed on any.
+    """
+    first, *others = floors
+    if not others:
+        return first
+    enabled = sorted({v for floor in floors for v in floor.enabled}, key=_age)[:1]
+    loaded = [v for v in (*first.enabled, *first.disabled) if all(v in (*o.enabled, *o.disabled) for o in others)]
+    failed = dict(pair for floor in floors for pair in floor.failed)
+    return Maps(
+        site_of(first.map_id), tuple(enabled), tuple(v for v in loaded if v not in enabled), tuple(failed.items())
+    )
+
+
+def _age(version: str) -> tuple[bool, int, str]:
+    """Sort key of versions, the oldest first; what is no number comes last."""
+    number = version.isascii() and version.isdigit() and len(version) < 10
+    return not number, int(version) if number else 0, version
+
+
 def read_state(message: Any) -> tuple[Maps, ...]:
     """The maps of a state message, by id; what it does not speak of is not there. Invalid says what is wrong with it.
 

@@ -14,7 +14,7 @@ from app.errors import Conflict, FleetMapError, Invalid, NotFound
 from app.store import tables
 from app.store.base import Base, clean, environment_row
 from app.store.overlays import CHANGE_CLOSURES
-from app.store.values import LATEST, Heard, Held, Move, Report, Robot
+from app.store.values import LATEST, NO_ROOT, Heard, Held, Move, Report, Robot
 
 HISTORY: Final = 200
 """So many reports of each robot in each environment are kept."""
@@ -180,15 +180,12 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
     values: dict[str, Any] = {**said, "said": report.said, "time": heard.time}
     again = known is not None and all(getattr(known, name) == value for name, value in said.items())
     if known is not None and not again and _told_before(connection, environment_id, heard, said):
-        connection.execute(update(table).where(*own).values(time=heard.time))
+        connection.execute(update(table).where(*own).values(time=heard.time, vouched=known.vouched or heard.vouched))
         return None
     if not again:
         values["since"] = heard.time
-    if report.state == "active":
-        same = known is not None and (known.held_root, known.held_overlays) == (report.root, report.overlays)
-        values |= {"held_version": report.version, "held_root": report.root, "held_sequence": report.sequence}
-        values["held_overlays"] = report.overlays
-        values["held_since"] = known.held_since if same and known is not None else heard.time
+    values["vouched"] = heard.vouched or (known is not None and known.vouched)
+    values |= _held_values(report, known, heard.time)
     if known is not None:
         connection.execute(update(table).where(*own).values(values))
     else:
@@ -203,6 +200,22 @@ def _note(connection: Connection, environment_id: str, heard: Heard) -> FleetMap
     if not again:
         _remember(connection, environment_id, heard, said)
     return None
+
+
+def _held_values(report: Report, known: Row[Any] | None, time: datetime) -> dict[str, Any]:
+    """What a robot runs, from its report: columns that change. Its own statement counts, whatever the report is about:
+    a status may be lost, so that a failure of the next version is the first that is received after a switch.
+    """
+    holds = (report.version, report.root) if report.state == "active" else report.holds
+    if holds is None:
+        return {}
+    version, root = holds
+    if root == NO_ROOT:
+        return dict.fromkeys(("held_version", "held_root", "held_sequence", "held_since", "held_overlays"))
+    same = known is not None and (known.held_root, known.held_overlays) == (root, report.overlays)
+    since = known.held_since if same and known is not None else time
+    values = {"held_version": version, "held_root": root, "held_sequence": report.sequence, "held_since": since}
+    return {**values, "held_overlays": report.overlays}
 
 
 def _told_before(connection: Connection, environment_id: str, heard: Heard, said: dict[str, Any]) -> bool:
@@ -261,4 +274,6 @@ def _as_robot(row: Row[Any]) -> Robot:
     held = None
     if row.held_root is not None:
         held = Held(row.held_version, row.held_root, row.held_sequence, row.held_since, row.held_overlays)
-    return Robot(row.robot, row.environment, _as_report(row), row.time, row.since, held, row.there, row.seen)
+    return Robot(
+        row.robot, row.environment, _as_report(row), row.time, row.since, held, row.there, row.seen, row.vouched
+    )

@@ -367,9 +367,10 @@ robot = Table(
     Column("held_sequence", BigInteger, nullable=True),
     Column("held_overlays", String(64), nullable=True),
     Column("held_since", Moment, nullable=True),
+    Column("vouched", Boolean, nullable=False, server_default=true()),
 )
 """Robots as they are now, for each environment. since: when they first said this. held: what they drive on, which a
-report of a map that is still being fetched does not change."""
+report of a map that is still being fetched does not change. vouched: whether any report came with authority."""
 
 robot_history = Table(
     "robot_history",

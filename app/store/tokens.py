@@ -33,11 +33,13 @@ class Tokens(Base):
     ) -> tuple[Token, str]:
         """A token and its secret, which is told only now.
 
-        environments: a name pattern (fnmatch). robot: whose status a robot's token may put. token: a secret chosen by
-        the operator; one that exists already is Conflict.
+        environments: a name pattern (fnmatch). robot: whose status a robot's token may put; required for the role
+        robot. token: a secret chosen by the operator; one that exists already is Conflict.
         """
         if role not in get_args(Role):
             raise Invalid(f"a role must be one of {', '.join(get_args(Role))}, got {role!r}")
+        if role == "robot" and robot is None:
+            raise Invalid("a token with the role robot must name its robot")
         if expires is not None and expires.tzinfo is None:
             raise Invalid("expires needs a time zone, for example 2027-01-01T00:00:00Z")
         if token is not None and not token:

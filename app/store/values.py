@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -438,7 +438,9 @@ class Job:
 @dataclass(frozen=True, slots=True)
 class Report:
     """What a robot says of itself. said: when, by its own clock. sequence: of the last event that it has processed.
-    overlays: digest of the closures in the map that the report is about; None from robots that know of none.
+
+    holds: version and root that it has loaded, ``NO_ROOT`` for none; None where it does not say. It is not part of the
+    history. overlays: digest of the closures in the map that it has loaded; None from robots that know of none.
     """
 
     channel: str
@@ -449,16 +451,21 @@ class Report:
     sequence: int | None = None
     said: datetime | None = None
     overlays: str | None = None
+    holds: tuple[int, str] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A report, of whom, and when it was heard by the server's clock."""
+    """A report, of whom, and when it was heard by the server's clock.
+
+    vouched: whether it came with authority: with a token that may report for the robot, or over a router with users.
+    """
 
     environment: str
     robot: str
     report: Report
     time: datetime
+    vouched: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -483,7 +490,8 @@ class Robot:
     """A robot in one environment, as it is now.
 
     time: of its last report. since: when it first said the same. there: its liveliness on the bus, as of ``seen``;
-    None where it never was on the bus.
+    None where it never was on the bus. vouched: whether any of its reports came with authority, so that it counts in
+    roll-outs.
     """
 
     robot: str
@@ -494,6 +502,7 @@ class Robot:
     held: Held | None
     there: bool | None = None
     seen: datetime | None = None
+    vouched: bool = True
 
     def failed_with(self, root: str) -> bool:
         """Whether it says that it failed with a version."""
@@ -509,6 +518,9 @@ class Move:
     root: str
     time: datetime
 
+
+NO_ROOT: Final = "0" * 64
+"""Root that a robot without a map reports."""
 
 OverlayState = Literal["pending", "accepted", "rejected", "expired", "ended", "kept"]
 

@@ -413,6 +413,7 @@ def test_a_mistake_of_ours_is_told_and_gone_on_from(fake: Fake, robot: Robot, mo
             eventually(lambda: one.saw("failed"))
             assert "made a mistake (KeyError at test_luck.py:" in one.detail
             eventually(lambda: fake.statuses[-1]["state"] == "failed")
+            assert (fake.statuses[-1]["version"], fake.statuses[-1]["holds"]["version"]) == (2, 1)
             patch.undo()
             eventually(lambda: one.saw("active", version=2))
 

@@ -73,7 +73,7 @@ class Api:
 
     def token_for(self, role: str, **more: Any) -> Api:
         """A client with a new token."""
-        return self.as_(self.post("tokens", {"name": f"a {role}", "role": role, **more}).json()["token"])
+        return self.as_(self.post("tokens", {"name": f"a-{role}", "role": role, **more}).json()["token"])
 
     def close(self) -> None:
         for other in self.others:

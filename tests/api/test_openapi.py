@@ -49,6 +49,7 @@ def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
         f"{e}/versions": "get post", v: "get", f"{v}/sources": "get", f"{v}/sources/{{name}}": "get",
         f"{v}/layers": "get", f"{v}/layers/{{layer}}": "get", f"{e}/edits": "post", f"{v}/maps": "get",
         f"{v}/maps/{{format}}": "get", f"{v}/maps/{{format}}/{{file}}": "get", f"{v}/reports/{{format}}": "get",
+        f"{v}/links": "post",
         "/api/v1/templates": "get", f"{e}/templates": "get put delete", f"{e}/templates/{{format}}": "get put delete",
         f"{e}/diff": "get", f"{v}/delta": "get", f"{e}/overlays": "get post",
         f"{e}/overlays/{{id}}/accept": "post", f"{e}/overlays/{{id}}/reject": "post",

@@ -33,6 +33,7 @@ def test_a_robot_tells_its_status(api: Api, farm: str) -> None:
     }  # fmt: skip
     assert told["time"] == "2030-12-31T23:00:00.000000Z"
     assert told["online"] is True
+    assert told["vouched"] is True
     assert told["lag"] == {"events": 0, "differs": False, "since": None}
     assert told["holds"] == {"version": 2, "root": root, "since": told["received"]}
     assert robot.get(f"robots?environment={farm}").json() == [told]
@@ -167,7 +168,7 @@ def test_who_may_tell(api: Api, farm: str, bare: str) -> None:
         caller("PUT", "robots/r-1/status", 200, json=said)
     assert "names the robot r-1" in mine.problem("PUT", "robots/r-2/status", 403, json=said)["detail"]
     mine.problem("PUT", "robots/r-1/status", 403, json=status(bare, "a" * 64))
-    assert "names no robot" in api.token_for("robot").problem("PUT", "robots/r-1/status", 403, json=said)["detail"]
+    assert "the robot a-robot" in api.token_for("robot").problem("PUT", "robots/r-1/status", 403, json=said)["detail"]
     api.token_for("viewer").problem("PUT", "robots/r-1/status", 403, json=said)
     mine.problem("DELETE", f"robots/r-1?environment={farm}", 403)
     other = api.token_for("viewer", environments=bare)
@@ -208,6 +209,30 @@ def test_all_robots_hold_the_root(api: Api, farm: str) -> None:
         "total": 3, "online": 3, "holding": 3, "lagging": 0, "failed": 0, "ready": 0,
         "since": last["holds"]["since"],
     }  # fmt: skip
+
+
+def test_channel_counts_what_robots_hold(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/channels"
+
+    def stand() -> tuple[int, int, int]:
+        robots = next(c for c in api.get(url).json() if c["channel"] == "production")["robots"]
+        return robots["holding"], robots["lagging"], robots["failed"]
+
+    roots = {v: root_of(api, farm, v) for v in (1, 2, 3)}
+    held = {v: {"version": v, "root": roots[v]} for v in roots}
+    api("PUT", f"{url}/production", 200, json={"version": 2})
+    api("PUT", "robots/k/status", 200, json={**status(farm, roots[1]), "version": 1})
+    assert stand() == (0, 1, 0)
+    failed = {**status(farm, roots[3], "failed", holds=held[2]), "version": 3}
+    told = api("PUT", "robots/k/status", 200, json=failed).json()
+    assert (told["version"], told["state"], told["holds"]["version"]) == (3, "failed", 2)
+    assert stand() == (1, 0, 0), "it holds what the channel points to, and refused what comes next"
+    api("PUT", "robots/k/status", 200, json={**failed, "holds": held[1]})
+    assert stand() == (0, 0, 1)
+    api("PUT", "robots/k/status", 200, json={**failed, "holds": {"version": 0, "root": "0" * 64}})
+    assert api.get(f"robots/k?environment={farm}").json()["holds"] is None
+    for bad in ({"version": 1}, {"version": -1, "root": "0" * 64}, {"version": 1, "root": "x"}, 1):
+        api.problem("PUT", "robots/k/status", 422, json={**failed, "holds": bad})
 
 
 def test_a_rollout(api: Api, farm: str) -> None:

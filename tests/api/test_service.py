@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 import yaml
+from sqlalchemy import update
 
+from app.store import tables
 from tests.api import samples
 from tests.api.conftest import ADMIN, API, Api, parts, problem, running, settings_for
 
@@ -260,6 +262,35 @@ def test_tokens(guarded: dict[str, Api]) -> None:
         {"name": "x", "role": "viewer", "expires": "2099-01-01T00:00:00"},
     ):
         api.problem("POST", "tokens", 422, json=bad)
+
+
+def test_robot_token_names_its_robot(guarded: dict[str, Api]) -> None:
+    api = guarded["first"]
+    assert api.post("tokens", {"name": "mower-3", "role": "robot"}).json()["robot"] == "mower-3"
+    made = api.post("tokens", {"name": "the red one", "role": "robot", "robot": "Mower.4"}).json()
+    assert (made["name"], made["robot"]) == ("the red one", "Mower.4")
+    assert api.post("tokens", {"name": "the red one", "role": "viewer"}).json()["robot"] is None
+    for bad, where in (
+        ({"name": "the red one"}, "name"), ({"name": "r/1"}, "name"), ({"name": "r" * 129}, "name"),
+        ({"name": "r", "robot": "a b"}, "robot"), ({"name": "r", "robot": "-r"}, "robot"),
+    ):  # fmt: skip
+        body = api.problem("POST", "tokens", 422, json={"role": "robot", **bad})
+        assert [e["where"] for e in body["errors"]] == [where]
+        assert "A-Z, a-z, 0-9" in body["detail"]
+
+
+def test_robot_token_without_a_robot_still_reads(guarded: dict[str, Api]) -> None:
+    """Tokens of releases that did not ask for a robot's name."""
+    api = guarded["first"]
+    old = api.token_for("robot", name="old-robot")
+    store = api.app.state.services.store
+    with store._database.write() as connection:
+        changed = connection.execute(update(tables.token).where(tables.token.c.name == "old-robot").values(robot=None))
+    assert changed.rowcount == 1
+    old.get(E)
+    old.get("/maps/farm-1/tmap2")
+    status = {"environment": "farm-1", "channel": "latest", "version": 1, "root": "0" * 64, "state": "active"}
+    assert "names no robot" in old.problem("PUT", "robots/old-robot/status", 403, json=status)["detail"]
 
 
 def test_a_token_ends(guarded: dict[str, Api]) -> None:

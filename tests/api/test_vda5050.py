@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import zipfile
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -13,7 +14,8 @@ from urllib.parse import urlsplit
 import pytest
 
 from app.errors import Invalid
-from app.fleet.vda5050 import Maps, read_state
+from app.fleet.vda5050 import Maps, read_state, whole_site
+from tests.api import samples
 from tests.api.conftest import Api
 
 REAL = sorted(Path(__file__).parents[2].parent.glob("shared/data/vda5050/*/*tate*"))
@@ -39,7 +41,7 @@ def test_actions_name_the_very_bytes(api: Api, farm: str) -> None:
     given = parameters(actions[0])
     link = urlsplit(given["mapDownloadLink"])
     assert f"{link.scheme}://{link.netloc}" == api.url
-    bundle = api.get(f"{link.path}?{link.query}").content
+    bundle = api.as_(None).get(f"{link.path}?{link.query}").content
     assert (hashlib.sha256(bundle).hexdigest(), len(bundle)) == (given["mapHash"], told["size"])
     assert sorted(zipfile.ZipFile(io.BytesIO(bundle)).namelist()) == ["map.png", "map.yaml"]
     again = api.get(f"environments/{farm}/versions/3/vda5050/actions?format=geojson").json()
@@ -50,6 +52,97 @@ def test_actions_name_the_very_bytes(api: Api, farm: str) -> None:
     api.problem("GET", f"{url}?nonsense=1", 422)
     api.problem("GET", f"{url}?format=occupancy_grid&grid=other", 404)
     api.problem("GET", f"environments/{farm}/versions/77/vda5050/actions", 404)
+
+
+@pytest.fixture
+def tower(api: Api, farm: str) -> str:
+    """The farm with a grid on the level L2 (version 4) and another level without one (version 5)."""
+    api.upload(farm, samples.grid(), level="L2")
+    api.upload(farm, {"n.tmap2.yaml": samples.tmap2()}, level="roof")
+    return farm
+
+
+def test_actions_come_for_each_level(api: Api, tower: str) -> None:
+    url = f"environments/{tower}/versions/latest/vda5050/actions"
+    nobody = api.as_(None)
+    every = api.get(f"{url}?level=*&grid=map&derive=false").json()
+    assert [(m["mapId"], m["level"], m["mapVersion"]) for m in every["maps"]] == [
+        (tower, "ground", "5"), (f"{tower}/L2", "L2", "5"),
+    ]  # fmt: skip
+    assert [m["level"] for m in every["missing"]] == ["roof"]
+    assert {k: every[k] for k in every["maps"][0]} == every["maps"][0]
+    links = [parameters(m["downloadMap"]) for m in every["maps"]]
+    for one, name in zip(links, ("ground", "L2"), strict=True):
+        assert f"level={name}" in one["mapDownloadLink"]
+        assert (
+            hashlib.sha256(nobody.get(one["mapDownloadLink"].removeprefix(api.url)).content).hexdigest()
+            == one["mapHash"]
+        )
+    upstairs = api.get(f"{url}?level=L2&grid=map").json()
+    assert (upstairs["mapId"], upstairs["level"], len(upstairs["maps"])) == (f"{tower}/L2", "L2", 1)
+    assert parameters(upstairs["enableMap"]) == {"mapId": f"{tower}/L2", "mapVersion": "5"}
+    assert api.get(f"{url}?level=ground").json()["mapId"] == tower
+    assert api.get(f"{url}?level=L2&mapId=upper").json()["mapId"] == "upper"
+    named = api.get(f"{url}?level=*&mapId=hall&grid=map").json()
+    assert [m["mapId"] for m in named["maps"]][:2] == ["hall", "hall/L2"]
+    assert "ground, L2, roof" in api.problem("GET", f"{url}?level=L9", 404)["detail"]
+    assert "no level has this map" in api.problem("GET", f"{url}?level=*&grid=other&derive=false", 422)["detail"]
+    told = api.problem("GET", f"{url}?level=*&format=nav2_route", 422)
+    assert "holds all levels" in told["detail"]
+    assert "occupancy_grid" in told["detail"]
+
+
+def test_lif_is_not_offered_to_vehicles(api: Api, farm: str) -> None:
+    told = api.problem("GET", f"environments/{farm}/versions/3/vda5050/actions?format=lif", 422)
+    assert "for the fleet manager, never for vehicles" in told["detail"]
+    api.get(f"environments/{farm}/versions/3/maps/lif")
+
+
+def test_links_of_actions_are_signed_unless_asked_otherwise(api: Api, farm: str) -> None:
+    url = f"environments/{farm}/versions/3/vda5050/actions?format=geojson"
+    made = api.get(f"{url}&seconds=60").json()
+    left = datetime.fromisoformat(made["expires"]) - datetime.now(UTC)
+    assert timedelta(seconds=30) < left <= timedelta(seconds=60)
+    plain = api.get(f"{url}&signed=false&derive=false").json()
+    link = parameters(plain["downloadMap"])["mapDownloadLink"]
+    assert link == f"{api.url}/api/v1/environments/{farm}/versions/3/maps/geojson?derive=false"
+    assert plain["expires"] is None
+    path = link.removeprefix(api.url)
+    api.as_(None).problem("GET", path, 401)
+    assert hashlib.sha256(api.get(path).content).hexdigest() == parameters(plain["downloadMap"])["mapHash"]
+    api.problem("GET", f"{url}&seconds=86401", 422)
+
+
+def test_floors_count_together(api: Api, tower: str) -> None:
+    api("PUT", f"environments/{tower}/channels/production", 200, json={"version": 4})
+    vehicle = api.token_for("robot", robot="agv-9")
+
+    def floors(ground: list[tuple[str, str]], upper: list[tuple[str, str]]) -> tuple[str, int, int | None]:
+        body = maps(tower, *ground)
+        body["maps"] += maps(f"{tower}/L2", *upper)["maps"]
+        (told,) = vehicle.post("robots/agv-9/vda5050/state", body, 200).json()["robots"]
+        assert told["environment"] == tower
+        return told["state"], told["version"], told["holds"] and told["holds"]["version"]
+
+    on, off = "ENABLED", "DISABLED"
+    assert floors([("4", on)], [("4", on)]) == ("active", 4, 4)
+    api("PUT", f"environments/{tower}/channels/production", 200, json={"version": 5, "rollout": {"ready": 1}})
+    assert floors([("4", on), ("5", off)], [("4", on)]) == ("active", 4, 4), "the upper floor is not there yet"
+    assert floors([("4", on), ("5", off)], [("4", on), ("5", off)]) == ("ready", 5, 4)
+    assert floors([("5", on)], [("4", on), ("5", off)])[2] == 4, "one floor still runs the old version"
+    assert floors([("5", on)], [("5", on)]) == ("active", 5, 5)
+    body = maps(f"{tower}/L2", ("5", on))
+    body["maps"] += maps("other/L2", ("5", on))["maps"]
+    vehicle.problem("POST", f"robots/agv-9/vda5050/state?environment={tower}", 422, json=body)
+    told = vehicle.post("robots/agv-9/vda5050/state", body, 200).json()
+    assert [i["mapId"] for i in told["ignored"]] == ["other/L2"]
+
+
+def test_whole_site_of_floors() -> None:
+    floors = (Maps("a", ("9",), ("10",), ()), Maps("a/L2", ("10",), ("9", "x"), (("11", "no room"),)))
+    assert whole_site(floors) == Maps("a", ("9",), ("10",), (("11", "no room"),))
+    assert whole_site(floors[1:]) == floors[1]
+    assert whole_site((Maps("a", ("x",), (), ()), Maps("a/b", ("2",), (), ()))).enabled == ("2",)
 
 
 def test_a_state_is_a_status(api: Api, farm: str) -> None:

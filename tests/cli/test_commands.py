@@ -7,6 +7,7 @@ import os
 import shlex
 import shutil
 import subprocess
+import urllib.request
 import zipfile
 from pathlib import Path
 
@@ -252,6 +253,34 @@ def test_tokens(fleetmap: Fleetmap, network: Path) -> None:
     gone = fleetmap("versions", "guarded", "--token", made["token"])
     assert gone.status == 1
     assert "--token" in gone.err
+
+
+def test_link_gives_a_map_without_a_token(fleetmap: Fleetmap, network: Path) -> None:
+    history(fleetmap, network, "linked")
+    assert fleetmap("promote", "linked", "1").status == 0
+    made = fleetmap("link", "linked", "tmap2", "network.tmap2.yaml", "--seconds", "600")
+    assert made.status == 0
+    assert "network.tmap2.yaml of version 1, without a token until" in made.err
+    with urllib.request.urlopen(made.out.strip()) as answer:
+        assert b"edge_id" in answer.read()
+    newest = fleetmap("link", "linked", "tmap2", "-V", "latest", "--json").json
+    assert (newest["version"], newest["name"]) == (2, "network.tmap2.yaml")
+    with urllib.request.urlopen(newest["url"]) as answer:
+        assert len(answer.read()) == newest["size"]
+    for wrong in (("nonsense",), ("tmap2", "other.yaml"), ("tmap2", "--seconds", "99999999")):
+        refused = fleetmap("link", "linked", *wrong)
+        assert (refused.status, refused.out) == (1, "")
+        assert "error:" in refused.err
+
+
+def test_robot_token_names_its_robot(fleetmap: Fleetmap) -> None:
+    assert fleetmap("token", "create", "mower-9", "--role", "robot", "--json").json["robot"] == "mower-9"
+    made = fleetmap("token", "create", "the red one", "--role", "robot", "--robot", "mower-9")
+    assert (made.status, "sets the status of the robot mower-9" in made.err) == (0, True)
+    for wrong in (("the red one", "--role", "robot"), ("x", "--role", "robot", "--robot", "a b")):
+        refused = fleetmap("token", "create", *wrong)
+        assert (refused.status, refused.out) == (1, "")
+        assert "--robot" in refused.err
 
 
 def test_usage_errors_have_their_own_status(fleetmap: Fleetmap, network: Path, tmp_path: Path) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
+import time
 from typing import Any
 
 import pytest
@@ -13,6 +15,7 @@ import zenoh
 from app.errors import Unavailable
 from app.fleet import Intake
 from app.store import Store
+from tests.api import samples
 from tests.api.conftest import Api
 from tests.events.conftest import client_config, eventually, said
 from tests.events.test_relay import router_of
@@ -36,6 +39,39 @@ def test_statuses_come_in_order(api: Api, session: zenoh.Session) -> None:
     history = api.get("robots/r1?limit=200").json()["history"]
     assert [h["sequence"] for h in history] == list(range(149, -1, -1))
     assert [r["robot"] for r in api.get("robots?environment=farm").json()] == ["r1", "r2"]
+
+
+def test_made_up_robots_of_an_open_router_do_not_count_in_a_rollout(api: Api, session: zenoh.Session) -> None:
+    api.post("environments", {"name": "farm"})
+    for k in range(2):
+        api.upload("farm", {"n.tmap2.yaml": samples.tmap2({"gate": (float(k), 0.0), "barn": (10.0, 0.0)})})
+    roots = [api.get(f"environments/farm/versions/{v}").json()["root"] for v in range(3)]
+    url = "environments/farm/channels/production"
+    api("PUT", url, 200, json={"version": 1})
+
+    def status(version: int, state: str) -> dict[str, Any]:
+        return {"channel": "production", "version": version, "root": roots[version], "state": state}
+
+    def on_bus(robot: str, version: int, state: str) -> None:
+        session.put(f"fleetmap/farm/robots/{robot}/status", json.dumps(status(version, state)).encode())
+        eventually(lambda: (r := robot_of(api, robot)) and (r["version"], r["state"]) == (version, state))
+
+    mower = api.token_for("robot", name="mower")
+    mower("PUT", "robots/mower/status", 200, json={"environment": "farm", **status(1, "active")})
+    for k in range(4):
+        on_bus(f"ghost-{k}", 1, "active")
+    api("PUT", url, 200, json={"version": 2, "rollout": {"ready": 1, "failed": 0.5}})
+    for k in range(4):
+        on_bus(f"ghost-{k}", 2, "failed" if k else "ready")
+    assert {r["robot"]: r["vouched"] for r in api.get("robots?environment=farm").json()} == {
+        "mower": True, **{f"ghost-{k}": False for k in range(4)},
+    }  # fmt: skip
+    time.sleep(2.5)  # the roll-out is looked at each second
+    channel = api.get("environments/farm/channels").json()[-1]
+    assert (channel["version"], channel["rollout"]["state"]) == (1, "waiting")
+    assert (channel["robots"]["total"], channel["robots"]["ready"]) == (5, 0)
+    on_bus("mower", 2, "ready")  # it counts for good, also with what it says on the bus
+    eventually(lambda: api.get("environments/farm/channels").json()[-1]["version"] == 2)
 
 
 def test_liveliness(api: Api, port: int) -> None:

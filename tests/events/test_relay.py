@@ -158,6 +158,8 @@ def test_a_router_of_the_operators(tmp_path: Path, caplog: pytest.LogCaptureFixt
     [
         (b"", "JSON"), (b"[]", "JSON"), (b"{}", "channel"), (b"[" * 100_000, "bytes"), (b"[" * 9_000, "JSON"),
         (b'{"channel": "production", "version": true, "root": "", "state": "happy"}', "state"),
+        (b'{"holds": 1}', "holds"), (b'{"holds": {"version": 1, "root": "x"}}', "holds"),
+        (b'{"holds": {"version": true, "root": "' + b"0" * 64 + b'"}}', "holds"),
     ],
 )  # fmt: skip
 def test_statuses_are_checked(payload: bytes, word: str) -> None:
@@ -168,6 +170,8 @@ def test_statuses_are_checked(payload: bytes, word: str) -> None:
 def test_a_status_comes_through() -> None:
     said = {"channel": "production", "version": 3, "root": "0" * 64, "state": "active", "sequence": 7}
     assert RobotStatus.from_json(json.dumps(said)).as_dict() == said
+    more = said | {"state": "failed", "detail": "no room", "holds": {"version": 2, "root": "a" * 64}}
+    assert RobotStatus.from_json(json.dumps(more)).as_dict() == more
 
 
 class Deaf:

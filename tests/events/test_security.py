@@ -118,6 +118,7 @@ def test_a_robot_hears_asks_and_tells(api: Api, r1: zenoh.Session) -> None:
     token = r1.liveliness().declare_token("fleetmap/robots/r1")
     r1.put("fleetmap/farm/robots/r1/status", said(1))
     assert eventually(lambda: (r := robot_of(api, "r1")) and r["online"] and r["version"] == 1)
+    assert robot_of(api, "r1")["vouched"], "the router lets in nobody but its users"
     token.undeclare()  # type: ignore[no-untyped-call]
     grid = grid_of(Heard(r1, f"0/map/{GRID}").wait())
     assert grid["cells"].shape == (6, 8)

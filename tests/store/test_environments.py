@@ -406,6 +406,8 @@ def test_tokens_are_kept_hashed(store: Store):
         store.create_token("empty", "admin", token="")
     with pytest.raises(Invalid, match="role"):
         store.create_token("x", "king")  # type: ignore[arg-type]
+    with pytest.raises(Invalid, match="must name its robot"):
+        store.create_token("mower", "robot")
     past, old = store.create_token("old", "viewer", expires=datetime.now(UTC) - timedelta(seconds=1))
     assert store.find_token(old) is None
     assert [t.id for t in store.tokens()] == [token.id, chosen.id, past.id]

@@ -13,7 +13,7 @@ from app.errors import Conflict, NotFound
 from app.fleet import holding, is_online, lag_of
 from app.store import Store, robots
 from app.store.changes import Replace
-from app.store.values import Heard, Held, Move, Report
+from app.store.values import NO_ROOT, Heard, Held, Move, Report
 from tests.store.samples import DATUM, GRID, grid, save
 
 NOW = datetime(2031, 5, 1, 14, 0, tzinfo=UTC)
@@ -33,6 +33,48 @@ def heard(robot: str, minute: float, root: str = A, state: Any = "active", **mor
 def farm(store: Store) -> Store:
     store.create_environment("farm")
     return store
+
+
+def test_held_version_follows_the_statement_of_the_robot(farm: Store):
+    def held() -> Held | None:
+        return farm.robots("farm", "r1")[0].held
+
+    def say(minute: float, root: str, state: Any, holds: tuple[int, str] | None, **more: Any) -> None:
+        assert farm.note_reports([heard("r1", minute, root, state, holds=holds, **more)]) == [None]
+
+    say(0, A, "active", None, sequence=3)
+    say(1, "c" * 64, "failed", (2, B), version=3, sequence=5)
+    assert held() == Held(2, B, 5, NOW + timedelta(minutes=1)), "the status active of B was lost"
+    say(2, "c" * 64, "failed", (2, B), version=3, sequence=5)
+    assert held() == Held(2, B, 5, NOW + timedelta(minutes=1))
+    assert len(farm.robot_history("farm", "r1")) == 2
+    say(3, "c" * 64, "failed", (1, A), version=3, sequence=5)
+    assert held() == Held(1, A, 5, NOW + timedelta(minutes=3)), "the same failure, and it went back"
+    say(4, "c" * 64, "downloading", None, version=3)
+    assert held() == Held(1, A, 5, NOW + timedelta(minutes=3)), "it does not say"
+    say(5, "c" * 64, "active", (1, A), version=3)
+    assert held() == Held(3, "c" * 64, None, NOW + timedelta(minutes=5)), "active is what it runs"
+    say(6, A, "downloading", (0, NO_ROOT), version=1)
+    assert held() is None, "its disk is empty"
+
+
+def test_authority_of_one_report_lasts(farm: Store):
+    def vouched() -> list[bool]:
+        return [r.vouched for r in farm.robots("farm")]
+
+    open_bus = {"vouched": False}
+    said = NOW
+    first, second = heard("r1", 0, A, said=said), heard("r1", 1, B, "ready", said=said)
+    farm.note_reports([replace(first, **open_bus), replace(second, **open_bus), replace(heard("r2", 0), **open_bus)])
+    assert vouched() == [False, False]
+    farm.note_reports([replace(first, time=NOW + timedelta(minutes=2))])
+    assert vouched() == [True, False], "the same report came late, over HTTP"
+    assert farm.robots("farm", "r1")[0].report.state == "ready"
+    farm.note_reports([replace(heard("r1", 3, A, "failed"), **open_bus), heard("r2", 3)])
+    assert vouched() == [True, True]
+    farm.forget_robot("farm", "r2")
+    farm.note_reports([replace(heard("r2", 4), **open_bus)])
+    assert vouched() == [True, False]
 
 
 def test_what_a_robot_drives_on_outlasts_what_it_fetches(farm: Store):
@@ -190,6 +232,10 @@ def test_convergence_is_proved(farm: Store):
     say("a", 20, old, "ready")
     ready = holding(farm.robots("farm"), planned, base, old)
     assert (ready.holding, ready.ready) == (1, 1)
+    report = Report("production", 1, old, "ready")
+    farm.note_reports([Heard("farm", "made-up", report, base + timedelta(seconds=21), vouched=False)])
+    ready = holding(farm.robots("farm"), planned, base, old)
+    assert (ready.total, ready.ready) == (2, 1), "it is listed, and does not count in the roll-out"
 
 
 def test_lag_counts_the_events_not_acted_on(sqlite_store: Store):

@@ -27,9 +27,9 @@ class Fleet:
     def at(self, seconds: float) -> datetime:
         return self.start + timedelta(seconds=seconds)
 
-    def say(self, robots: str, version: int, state: Any, seconds: float = 1) -> None:
+    def say(self, robots: str, version: int, state: Any, seconds: float = 1, *, vouched: bool = True) -> None:
         report = Report("production", version, self.roots[version], state)
-        assert not any(self.store.note_reports([Heard("farm", r, report, self.at(seconds)) for r in robots]))
+        assert not any(self.store.note_reports([Heard("farm", r, report, self.at(seconds), vouched) for r in robots]))
 
     def roll(self, version: int = 2, activate_at: datetime | None = None, **more: Any) -> Channel:
         rollout = Rollout(0, "", self.start, **more)
@@ -54,6 +54,25 @@ class Fleet:
 @pytest.fixture
 def fleet(store: Store) -> Fleet:
     return Fleet(store)
+
+
+def test_robots_without_authority_neither_move_nor_stop_a_rollout(fleet: Fleet):
+    fleet.say("ab", 1, "active")
+    fleet.say("wxyz", 1, "active", vouched=False)
+    fleet.roll(ready=1, failed=0.4)
+    fleet.say("wxyz", 2, "ready", 2, vouched=False)
+    assert fleet.tick(3) == (1, "waiting")
+    fleet.say("wxy", 2, "failed", 4, vouched=False)
+    fleet.say("a", 2, "ready", 4)
+    assert fleet.tick(5) == (1, "waiting"), "one of two is ready, and none of the two failed"
+    fleet.say("b", 2, "ready", 6, vouched=False)
+    assert fleet.tick(7) == (2, "watching"), "b has reported with authority before"
+    fleet.say("wxyz", 2, "failed", 8, vouched=False)
+    assert fleet.tick(9) == (2, "watching")
+    fleet.say("w", 2, "failed", 10)
+    assert fleet.tick(11) == (2, "watching"), "w counts from now on, and is one of three"
+    fleet.say("x", 2, "failed", 12)
+    assert fleet.tick(13) == (1, "rolled_back")
 
 
 def test_it_moves_when_enough_are_ready(fleet: Fleet):

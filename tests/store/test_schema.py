@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
 
 from app.errors import Unavailable
 from app.store import Store
 from app.store.database import Database
-from app.store.schema import comparison
+from app.store.schema import comparison, config
 from app.store.tables import metadata
+from app.store.values import Heard, Report
 
 
 def test_models_and_migrations_do_not_differ(store: Store, database_url: str):
@@ -37,6 +41,23 @@ def test_the_comparison_sees_a_missing_column(store: Store, database_url: str):
 def test_migrating_again_changes_nothing_and_check_passes(store: Store):
     store.migrate()
     store.check()
+
+
+def test_robots_of_before_are_vouched_for(store: Store, database_url: str):
+    store.create_environment("farm")
+    report = Report("latest", 0, "a" * 64, "active")
+    store.note_reports([Heard("farm", "old", report, datetime.now(UTC), vouched=False)])
+    settings = config()
+    before = ScriptDirectory.from_config(settings).get_revision("0008").down_revision
+    database = Database(database_url, readonly=False)
+    with database.engine.connect() as connection:
+        connection.execution_options(write=True)
+        with connection.begin():
+            settings.attributes["connection"] = connection
+            command.downgrade(settings, str(before))
+    database.close()
+    store.migrate()
+    assert [r.vouched for r in store.robots("farm")] == [True]
 
 
 def test_check_fails_before_migration(database_url: str, tmp_path: Path):

@@ -1,0 +1,117 @@
+"""Signed links to maps, for clients that have no place for a token."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from urllib.parse import quote, urlencode
+
+from fastapi import APIRouter, Request
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import Response
+
+from app.api.access import Principal, Viewer
+from app.api.answers import API, Route, answer
+from app.api.jobs import Started, started
+from app.api.maps import Wanted, made_at, number_of
+from app.api.schemas import EnvironmentPath, LinkBody, LinkOut, VersionPath, told
+from app.api.services import Here, Services
+from app.api.signed import Grant
+from app.convert.cache import MadeFile
+from app.convert.maps import file_of
+from app.store.values import Version, rfc3339
+
+router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=Route)
+
+
+@router.post(
+    "/links",
+    status_code=201,
+    responses={
+        **told(LinkOut, 400, 404, 409, 415, ok=201, description="The link"),
+        202: {"description": "The map takes long: follow the job at `Location`, then ask again."},
+    },
+    summary="Create a signed link to a map",
+)
+async def create_link(
+    env: EnvironmentPath, v: VersionPath, body: LinkBody, request: Request, here: Here, who: Viewer
+) -> Response:
+    """The `url` needs no token until it `expires`, for `GET` and `HEAD` alone.
+
+    It names the version by number, so that its bytes stay the same, and ends with the environment. It does not outlive
+    the token that created it, but is not revoked with it. The map is converted first: a map that cannot be made has no
+    link.
+    """
+    here.links.check_life(body.seconds)
+    version = await run_in_threadpool(here.store.version, env, number_of(v))
+    values = {name: _text(value) for name, value in body.parameters.items()}
+    linked = await link_to(here, request, who, version, body.format, body.file, values, body.seconds)
+    if isinstance(linked, Started):
+        return started(linked.job)
+    out = {
+        "url": linked.url,
+        "expires": linked.expires,
+        "version": version.number,
+        "root": version.root,
+        "name": linked.file.name,
+        "size": linked.file.size,
+        "sha256": linked.file.sha256,
+    }
+    return answer(out, 201, {"cache-control": "no-store"})
+
+
+@dataclass(frozen=True, slots=True)
+class LinkedFile:
+    """A file behind a link. url: full address. expires: RFC 3339; None for a link that needs a token."""
+
+    url: str
+    expires: str | None
+    file: MadeFile
+
+
+async def link_to(
+    here: Services,
+    request: Request,
+    who: Principal,
+    version: Version,
+    format: str,
+    file: str | None,
+    values: dict[str, str],
+    seconds: int | None = None,
+    *,
+    signed: bool = True,
+) -> LinkedFile | Started:
+    """Convert a version's map, and link to it or to one of its files; the job where converting takes long.
+
+    Args:
+        values: the map's parameters, as in its address.
+        seconds: life of the link; default: the maximum.
+        signed: whether the link needs no token.
+
+    Raises what converting raises; NotFound for a file that the map does not have.
+    """
+    wanted = Wanted(version.environment, str(version.number), format, file)
+    outcome = await made_at(here, wanted, urlencode(sorted(values.items())).encode(), who)
+    if isinstance(outcome, Started):
+        return outcome
+    found = file_of(*outcome, file)
+    path = f"{API}/environments/{version.environment}/versions/{version.number}/maps/{format}"
+    path += "" if file is None else f"/{file}"
+
+    base = str(request.base_url).rstrip("/")
+    if not signed:
+        query = urlencode(sorted(values.items()))
+        return LinkedFile(base + quote(path, safe="/") + (f"?{query}" if query else ""), None, found)
+
+    def sign() -> Grant:
+        environment = here.store.environment(version.environment)
+        return here.links.create(environment, path, values, seconds or here.links.max_seconds, who)
+
+    grant = await run_in_threadpool(sign)
+    return LinkedFile(base + grant.url, rfc3339(grant.expires), found)
+
+
+def _text(value: str | float | bool) -> str:
+    """A parameter as an address has it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return value if isinstance(value, str) else repr(value)

@@ -1,0 +1,111 @@
+"""Signed links at the door: which requests are by a link, whether it is genuine, and making links."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from urllib.parse import quote
+
+from starlette.types import Scope
+
+from app import links
+from app.api.access import Access, Principal
+from app.api.answers import API
+from app.errors import Invalid, InvalidLink, NotFound, Problem
+from app.links import LinkSecrets, SignedAddress
+from app.store.values import Environment
+
+_MAP = re.compile(
+    rf"(?:{API}/environments/(?P<long>[^/]+)/versions/[^/]+/maps|/maps/(?P<short>[^/]+))/[^/]+(?:/.+)?", re.DOTALL
+)
+
+LINK = "link"
+"""Id and name of the principal of a request by link, and the member of a request's state that has the link."""
+
+
+def signed_address(scope: Scope) -> SignedAddress | None:
+    """The link that a request was made by; None for all other requests. Only maps are given by link, and only read.
+
+    Raises InvalidLink where the query has a signature but is no link.
+    """
+    query: bytes = scope["query_string"]
+    if b"signature=" not in query or scope["method"] != "GET" or _MAP.fullmatch(scope["path"]) is None:
+        return None
+    return links.parse(scope["path"], query)
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """A link that was made. url: without scheme and host."""
+
+    url: str
+    expires: datetime
+
+
+class SignedLinks:
+    """Makes links and checks them.
+
+    max_seconds: maximum life of a link. find: an environment by name; raises NotFound.
+    """
+
+    def __init__(
+        self,
+        secrets: LinkSecrets,
+        access: Access,
+        find: Callable[[str], Environment],
+        max_seconds: int,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._secrets, self._access, self._find, self._clock = secrets, access, find, clock
+        self.max_seconds = max_seconds
+
+    def check_life(self, seconds: int | None) -> None:
+        """Invalid for a link that should live longer than the maximum."""
+        if seconds is not None and seconds > self.max_seconds:
+            limit = f"at most {self.max_seconds} (FLEETMAP_LINK_SECONDS)"
+            raise Invalid(f"seconds must be {limit}, got {seconds}", [Problem(f"must be {limit}", where="seconds")])
+
+    def create(
+        self, environment: Environment, path: str, parameters: Mapping[str, str], seconds: int, creator: Principal
+    ) -> Grant:
+        """Make a link to a map's path (percent-decoded). It does not outlive the token of its creator."""
+        expires = int(self._clock()) + min(seconds, self.max_seconds)
+        if creator.expires is not None:
+            expires = min(expires, int(creator.expires.timestamp()))
+        query = links.sign(self._secrets.newest(), environment.id, path, parameters, expires)
+        return Grant(f"{quote(path, safe='/')}?{query}", datetime.fromtimestamp(expires, UTC))
+
+    def check(self, address: SignedAddress, client: str | None) -> Principal:
+        """The caller with this link, who may read what it names. Asks the store, so call it from a thread.
+
+        A genuine link is accepted also from an address that sent too many wrong tokens: nobody guesses one.
+
+        Raises:
+            InvalidLink: the signature is wrong, which counts as a wrong token, or the environment was deleted.
+            ExpiredLink: its time is over.
+            Throttled: the signature is wrong, and so were too many before it.
+        """
+        now = self._clock()
+        try:
+            links.check(self._secrets.valid(now), address, now)
+        except InvalidLink:
+            self._access.note_guess(client)
+            raise
+        found = _MAP.fullmatch(address.path)
+        name = (found["long"] or found["short"]) if found else ""
+        try:
+            environment = self._find(name)
+        except NotFound:
+            environment = None
+        if environment is None or environment.id != address.environment_id:
+            raise InvalidLink(
+                f"the environment of this link was deleted or renamed ({name[:80]!r}): request a new link"
+            )
+        return Principal(LINK, LINK, "viewer", name, None, datetime.fromtimestamp(address.expires, UTC))
+
+    def rotate(self) -> None:
+        """Sign links with a new secret; those made before stay valid until they expire."""
+        self._secrets.rotate(self._clock(), self.max_seconds)

@@ -1,0 +1,202 @@
+"""Signed links: an address of a map that needs no token until it expires.
+
+A link is the map's address with two more query parameters: ``expires`` (seconds since 1970) and ``signature``
+(``<environment id>.<HMAC-SHA-256 in base64url>``). The code covers the environment's id, the path, all other parameters
+in the order of their names, and the expiry. The id makes a link end with its environment, also where another
+environment gets the same name. The secrets are a file that only the server reads; all processes of a data folder share
+it.
+"""
+
+from __future__ import annotations
+
+import base64
+import fcntl
+import hashlib
+import hmac
+import json
+import os
+import secrets
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import parse_qsl, urlencode
+
+from app.errors import ExpiredLink, InvalidLink
+
+EXPIRES = "expires"
+SIGNATURE = "signature"
+
+SECRET_BYTES = 32
+MAX_SECRETS = 16
+"""Maximum number of secrets: after more rotations within the life of a link the oldest is dropped."""
+
+MAX_PARAMETERS = 100
+_PURPOSE = "fleetmap-link-1"
+
+
+@dataclass(frozen=True, slots=True)
+class SignedAddress:
+    """An address with a signature, which is not checked yet.
+
+    path: percent-decoded. query: the map's own parameters, percent-encoded, without ``expires`` and ``signature``.
+    expires: seconds since 1970.
+    """
+
+    path: str
+    query: bytes
+    expires: int
+    signature: str
+
+    @property
+    def environment_id(self) -> str:
+        """Id of the environment that the link was made for, as the link states it."""
+        return self.signature.partition(".")[0]
+
+
+def parse(path: str, query: bytes) -> SignedAddress | None:
+    """Read a signed address; None for an address without ``signature``.
+
+    Raises:
+        InvalidLink: ``expires`` is missing or no number, a parameter is duplicate, or the query cannot be read.
+    """
+    if SIGNATURE.encode() + b"=" not in query:
+        return None
+    try:
+        pairs = parse_qsl(query.decode("ascii"), keep_blank_values=True, max_num_fields=MAX_PARAMETERS, errors="strict")
+    except ValueError:
+        raise InvalidLink(
+            "the link's query cannot be read: it must be percent-encoded UTF-8 with at most "
+            f"{MAX_PARAMETERS} parameters; use the link exactly as it was given"
+        ) from None
+    values = dict(pairs)
+    if SIGNATURE not in values:
+        return None
+    if len(values) != len(pairs):
+        raise InvalidLink("the link has a duplicate parameter: use it exactly as it was given")
+    signature, text = values.pop(SIGNATURE), values.pop(EXPIRES, "")
+    if not (text.isascii() and text.isdigit() and len(text) <= 12):
+        raise InvalidLink(
+            "the link has no valid 'expires' (seconds since 1970): use it exactly as it was given, or request a new one"
+        )
+    return SignedAddress(path, _canonical(values), int(text), signature)
+
+
+def sign(secret: bytes, environment_id: str, path: str, parameters: Mapping[str, str], expires: int) -> str:
+    """Create the query of a signed link: the parameters in the order of their names, the expiry, the signature."""
+    query = _canonical(parameters)
+    code = _code(secret, environment_id, path, query, expires)
+    ending = urlencode({EXPIRES: expires, SIGNATURE: f"{environment_id}.{code}"})
+    return f"{query.decode()}&{ending}" if query else ending
+
+
+def check(keys: list[bytes], address: SignedAddress, now: float) -> None:
+    """Check a link's signature against each valid secret, in constant time, then its expiry.
+
+    Raises:
+        InvalidLink: it was altered, or was not made by this server.
+        ExpiredLink: it is genuine, but its time is over.
+    """
+    environment_id, _, code = address.signature.partition(".")
+    given = code.encode("utf-8", "surrogatepass")
+    genuine = False
+    for secret in keys:
+        expected = _code(secret, environment_id, address.path, address.query, address.expires).encode()
+        genuine |= hmac.compare_digest(expected, given)
+    if not genuine:
+        raise InvalidLink(
+            "the link's signature does not match its address: it was altered, its secret is no longer valid, or "
+            "another server made it; use it exactly as it was given, or request a new one"
+        )
+    if address.expires <= now:
+        raise ExpiredLink("the link has expired: request a new one")
+
+
+def _canonical(parameters: Mapping[str, str]) -> bytes:
+    return urlencode(sorted(parameters.items())).encode()
+
+
+def _code(secret: bytes, environment_id: str, path: str, query: bytes, expires: int) -> str:
+    text = json.dumps([_PURPOSE, environment_id, path, query.decode(), expires], separators=(",", ":"))
+    digest = hmac.digest(secret, text.encode(), hashlib.sha256)
+    return base64.urlsafe_b64encode(digest).rstrip(b"=").decode()
+
+
+@dataclass(frozen=True, slots=True)
+class _Secret:
+    """until: seconds since 1970 up to which links made with it are valid; None for the newest."""
+
+    value: bytes
+    until: float | None
+
+
+class LinkSecrets:
+    """The secrets of a folder, in ``links.json``; created when first needed. Safe for threads and processes."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = folder / "links.json"
+        self._lock = threading.Lock()
+        self._cached: tuple[int, list[_Secret]] | None = None
+
+    def newest(self) -> bytes:
+        """The secret that signs."""
+        return self._load()[0].value
+
+    def valid(self, now: float) -> list[bytes]:
+        """All secrets whose links are still accepted, the newest first."""
+        return [s.value for s in self._load() if s.until is None or now < s.until]
+
+    def rotate(self, now: float, seconds: float) -> None:
+        """Sign with a new secret from now on; the old one stays valid for ``seconds``, until its links have ended."""
+        with self._exclusive():
+            old = [_Secret(s.value, now + seconds if s.until is None else s.until) for s in self._read()]
+            kept = [s for s in old if s.until is not None and now < s.until]
+            self._write([_new_secret(), *kept][:MAX_SECRETS])
+
+    def _load(self) -> list[_Secret]:
+        with self._lock:
+            stamp = self._stamp()
+            if self._cached is None or self._cached[0] != stamp:
+                if stamp == 0:
+                    with self._exclusive():
+                        if self._stamp() == 0:
+                            self._write([_new_secret()])
+                stamp = self._stamp()  # before the content is read: a change in between is read again
+                self._cached = (stamp, self._read())
+            return self._cached[1]
+
+    def _stamp(self) -> int:
+        try:
+            return self._file.stat().st_mtime_ns
+        except FileNotFoundError:
+            return 0
+
+    def _read(self) -> list[_Secret]:
+        try:
+            lines = json.loads(self._file.read_bytes())
+        except FileNotFoundError:
+            return []
+        return [_Secret(base64.b64decode(line["secret"]), line["until"]) for line in lines]
+
+    def _write(self, lines: list[_Secret]) -> None:
+        """Replace the file as a whole, readable by its owner only."""
+        body = [{"secret": base64.b64encode(s.value).decode(), "until": s.until} for s in lines]
+        temporary = self._file.with_suffix(f".{os.getpid()}")
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with os.fdopen(descriptor, "w") as handle:
+            json.dump(body, handle, indent=1)
+            handle.flush()
+            os.fsync(handle.fileno())
+        temporary.replace(self._file)
+
+    @contextmanager
+    def _exclusive(self) -> Iterator[None]:
+        self._file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with (self._file.parent / "lock").open("w") as handle:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+
+
+def _new_secret() -> _Secret:
+    return _Secret(secrets.token_bytes(SECRET_BYTES), None)

@@ -1,0 +1,360 @@
+"""Signed links: what they open, for how long, and what they do not open."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import sqlite3
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl, urlencode, urlsplit
+
+import httpx
+import pytest
+
+from app import links
+from app.errors import ExpiredLink, InvalidLink
+from app.links import LinkSecrets
+from tests.api import samples
+from tests.api.conftest import Api, problem, running, settings_for
+
+NOW = 1_800_000_000.0
+
+
+# --- the signature ---
+
+
+def signed(secret: bytes, path: str, expires: int, **parameters: str) -> links.SignedAddress:
+    query = links.sign(secret, "e1", path, parameters, expires)
+    found = links.parse(path, query.encode())
+    assert found is not None
+    return found
+
+
+def test_signature_holds_for_parameters_in_any_order() -> None:
+    query = links.sign(b"k", "e1", "/maps/farm/kml", {"b": "2 &é", "a": "1"}, int(NOW) + 9)
+    pairs = parse_qsl(query)
+    for order in (pairs, pairs[::-1]):
+        found = links.parse("/maps/farm/kml", urlencode(order).encode())
+        assert found is not None
+        assert (found.query, found.expires, found.environment_id) == (b"a=1&b=2+%26%C3%A9", int(NOW) + 9, "e1")
+        links.check([b"other", b"k"], found, NOW)
+
+
+def test_signature_covers_path_parameters_expiry_and_environment() -> None:
+    good = signed(b"k", "/maps/farm/kml", int(NOW) + 9, a="1")
+    links.check([b"k"], good, NOW)
+    e1, _, code = good.signature.partition(".")
+    altered: list[dict[str, Any]] = [
+        {"path": "/maps/farm/kmz"}, {"path": "/maps/farm/kml/map.kml"}, {"query": b""}, {"query": b"a=2"},
+        {"query": b"a=1&b=1"}, {"expires": int(NOW) + 10}, {"signature": f"e2.{code}"}, {"signature": f"{e1}.{code}="},
+        {"signature": f"{e1}.{code[:-1]}"}, {"signature": code}, {"signature": ""}, {"signature": f"{e1}.\udcff"},
+    ]  # fmt: skip
+    for change in altered:
+        values = {name: getattr(good, name) for name in ("path", "query", "expires", "signature")} | change
+        with pytest.raises(InvalidLink):
+            links.check([b"k"], links.SignedAddress(**values), NOW)
+    with pytest.raises(InvalidLink):
+        links.check([b"j"], good, NOW)
+    with pytest.raises(InvalidLink):
+        links.check([], good, NOW)
+
+
+def test_genuine_link_ends_at_its_expiry() -> None:
+    link = signed(b"k", "/maps/farm/kml", int(NOW) + 9)
+    links.check([b"k"], link, NOW + 8.9)
+    for late in (9.0, 10.0, 1e9):
+        with pytest.raises(ExpiredLink, match="request a new one"):
+            links.check([b"k"], link, NOW + late)
+
+
+@pytest.mark.parametrize("expires", ["", "x", "-1", "1e9", "١٢٣", "1" * 13, None])
+def test_link_without_a_number_of_seconds_is_invalid(expires: str | None) -> None:
+    query = urlencode({"signature": "e.x", **({} if expires is None else {"expires": expires})})
+    with pytest.raises(InvalidLink, match="expires"):
+        links.parse("/maps/farm/kml", query.encode())
+
+
+def test_query_without_signature_is_no_link() -> None:
+    assert links.parse("/maps/farm/kml", b"expires=1") is None
+    assert links.parse("/maps/farm/kml", b"my_signature=1&expires=1") is None
+    for bad in (b"signature=%ff", b"signature=a&expires=1&x=1&x=2", b"signature=a&signature=b&expires=1"):
+        with pytest.raises(InvalidLink):
+            links.parse("/maps/farm/kml", bad)
+
+
+# --- the secrets ---
+
+
+def test_secrets_are_shared_and_read_by_their_owner_only(tmp_path: Path) -> None:
+    one, two = LinkSecrets(tmp_path / "keys"), LinkSecrets(tmp_path / "keys")
+    with ThreadPoolExecutor(8) as pool:
+        assert len(set(pool.map(lambda k: (one, two)[k % 2].newest(), range(32)))) == 1
+    assert len(one.newest()) == 32
+    assert (tmp_path / "keys" / "links.json").stat().st_mode & 0o077 == 0
+
+
+def test_rotated_secret_stays_valid_until_its_links_have_ended(tmp_path: Path) -> None:
+    one, two = LinkSecrets(tmp_path), LinkSecrets(tmp_path)
+    old = one.newest()
+    one.rotate(NOW, 60)
+    new = two.newest()
+    assert new != old
+    assert two.valid(NOW + 59) == one.valid(NOW + 59) == [new, old]
+    assert two.valid(NOW + 60) == [new]
+    one.rotate(NOW + 61, 60)
+    assert [s["until"] for s in json.loads((tmp_path / "links.json").read_text())] == [None, NOW + 121], (
+        "old is removed"
+    )
+    for k in range(40):
+        one.rotate(NOW + 62 + k / 10, 60)
+    assert len(two.valid(NOW + 66)) == links.MAX_SECRETS
+
+
+# --- over HTTP ---
+
+
+def link(api: Api, env: str, version: int | str = "latest", **body: Any) -> dict[str, Any]:
+    """A new link, as the API returns it but for the server's own address before ``url``."""
+    found: dict[str, Any] = api.post(f"environments/{env}/versions/{version}/links", body).json()
+    assert found["url"].startswith(f"{api.url}/api/v1/environments/{env}/versions/{found['version']}/maps/")
+    return found | {"url": found["url"].removeprefix(api.url)}
+
+
+def altered(url: str, **change: str | None) -> str:
+    """The link with other query parameters."""
+    parts = urlsplit(url)
+    values = {k: v for k, v in (dict(parse_qsl(parts.query)) | change).items() if v is not None}
+    return f"{parts.path}?{urlencode(values)}"
+
+
+def test_link_needs_no_token(api: Api, farm: str) -> None:
+    nobody = api.as_(None)
+    with_token = api.get(f"environments/{farm}/versions/3/maps/occupancy_grid/map.png?file_type=png&grid=map")
+    made = link(api, farm, format="occupancy_grid", file="map.png", parameters={"grid": "map", "file_type": "png"})
+    assert made["url"].startswith(f"/api/v1/environments/{farm}/versions/3/maps/occupancy_grid/map.png?")
+    assert (made["version"], made["name"]) == (3, "map.png")
+    for _ in range(3):
+        answer = nobody.get(made["url"])
+        assert answer.content == with_token.content
+        assert (answer.headers["etag"], answer.headers["fleetmap-version"]) == (with_token.headers["etag"], "3")
+        assert answer.headers["referrer-policy"] == "no-referrer"
+        assert "private" in answer.headers["cache-control"]
+    assert (hashlib.sha256(answer.content).hexdigest(), len(answer.content)) == (made["sha256"], made["size"])
+    assert "referrer-policy" not in with_token.headers
+    unchanged = nobody.get(made["url"], 304, headers={"If-None-Match": answer.headers["etag"]})
+    assert unchanged.headers["referrer-policy"] == "no-referrer"
+    head = nobody("HEAD", made["url"], 200)
+    assert (head.content, head.headers["content-length"]) == (b"", str(made["size"]))
+    part = nobody.get(made["url"], 206, headers={"Range": "bytes=2-5"})
+    assert part.content == answer.content[2:6]
+    api.upload(farm, {"more.kml": samples.KML})
+    assert nobody.get(made["url"]).content == answer.content, "it names the version by number"
+    whole = link(api, farm, "latest", format="occupancy_grid")
+    assert nobody.get(whole["url"]).headers["content-type"] == "application/zip"
+
+
+def test_short_address_can_be_signed(api: Api, farm: str) -> None:
+    services = api.app.state.services
+    environment = services.store.environment(farm)
+    creator = services.access.check(f"Bearer {api.token}".encode(), None)
+    for path in (f"/maps/{farm}/tmap2", f"/maps/{farm}/tmap2/network.tmap2.yaml"):
+        grant = services.links.create(environment, path, {}, 60, creator)
+        for _ in range(2):
+            assert api.as_(None).get(grant.url).content == api.get(path).content
+
+
+@pytest.mark.parametrize("warm", [False, True])
+def test_altered_link_is_refused(api: Api, farm: str, warm: bool) -> None:
+    nobody = api.as_(None)
+    url = link(api, farm, format="geojson", parameters={"derive": False})["url"]
+    assert "derive=false" in url
+    if warm:
+        nobody.get(url)
+        api.get(urlsplit(url).path)
+    other = link(api, farm, format="tmap2")["url"]
+    good = dict(parse_qsl(urlsplit(url).query))
+    try:
+        for change in (
+            {"derive": None}, {"derive": "true"}, {"expires": str(int(good["expires"]) + 1)}, {"signature": "x"},
+            {"signature": dict(parse_qsl(urlsplit(other).query))["signature"]}, {"crs": "local"},
+        ):  # fmt: skip
+            body = nobody.problem("GET", altered(url, **change), 403)
+            assert (body["type"], body["title"]) == ("urn:fleetmap:problem:invalid-link", "Invalid link")
+            assert "request a new one" in body["detail"]
+        query = urlsplit(url).query
+        for path in (f"environments/{farm}/versions/2/maps/geojson", f"/maps/{farm}/geojson",
+                     f"environments/{farm}/versions/3/maps/tmap2"):  # fmt: skip
+            nobody.problem("GET", f"{path}?{query}", 403)
+        assert "valid 'expires'" in nobody.problem("GET", altered(url, expires=None), 403)["detail"]
+        nobody.problem("GET", altered(url, signature=None), 401)
+        api.problem("GET", altered(url, derive="true"), 403)  # a token beside a link counts for nothing
+        nobody.get(url)
+    finally:
+        services = api.app.state.services
+        services.access._sources.clear()
+
+
+def test_link_opens_nothing_else(api: Api, farm: str) -> None:
+    nobody = api.as_(None)
+    url = link(api, farm, format="geojson")["url"]
+    query = urlsplit(url).query
+    for path in (f"environments/{farm}", f"environments/{farm}/versions/3", f"environments/{farm}/versions/3/maps",
+                 f"environments/{farm}/versions/3/reports/geojson", "formats", "/metrics",
+                 f"environments/{farm}/versions/3/manifest"):  # fmt: skip
+        nobody.problem("GET", f"{path}?{query}", 401)
+    for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS"):
+        nobody.problem(method, url, 401)
+    api.problem("GET", f"environments/{farm}/versions/3/maps/geojson?%73ignature=x&expires=1", 422)
+
+
+def test_link_ends(api: Api, farm: str) -> None:
+    nobody = api.as_(None)
+    made = link(api, farm, format="geojson", seconds=2)
+    assert nobody.get(made["url"]).content
+    deadline = time.monotonic() + 30
+    while (answer := nobody.get(made["url"], None)).status_code == 200:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    assert datetime.now(UTC) >= datetime.fromisoformat(made["expires"])
+    body = problem(answer)
+    assert (answer.status_code, body["type"]) == (403, "urn:fleetmap:problem:expired-link")
+    assert body["detail"] == "the link has expired: request a new one"
+    for _ in range(40):
+        nobody.problem("GET", made["url"], 403)  # an old link is no guess
+
+
+def test_link_ends_with_its_environment(api: Api, farm: str) -> None:
+    nobody = api.as_(None)
+    url = link(api, farm, format="datum")["url"]
+    nobody.get(url)
+    api("DELETE", f"environments/{farm}", 204)
+    assert "deleted or renamed" in nobody.problem("GET", url, 403)["detail"]
+    api("POST", f"environments/{farm}/restore", 200)
+    nobody.get(url)
+    api("DELETE", f"environments/{farm}", 204)
+    api("POST", f"environments/{farm}/purge")
+    api.post("environments", {"name": farm})
+    for k in range(3):
+        api.upload(farm, {"datum.yaml": samples.DATUM.replace(b"53.", b"5%d." % k)})
+    for _ in range(3):
+        nobody.problem("GET", url, 403)
+
+
+def test_link_is_created_by_readers_of_its_environment(api: Api, farm: str, bare: str) -> None:
+    path, body = f"environments/{farm}/versions/3/links", {"format": "geojson"}
+    for role in ("viewer", "robot", "editor"):
+        api.token_for(role, environments=farm).post(path, body)
+    api.token_for("viewer", environments=bare).problem("POST", path, 403, json=body)
+    api.as_(None).problem("POST", path, 401, json=body)
+    for bad, status in (
+        ({"format": "nothing"}, 404), ({"format": "geojson", "file": "x"}, 404),
+        ({"format": "geojson", "seconds": 0}, 422),
+        ({"format": "geojson", "seconds": 86_401}, 422), ({"format": "geojson", "parameters": {"nonsense": 1}}, 422),
+        ({"format": "geojson", "parameters": {"signature": "x"}}, 422), ({"format": "geojson", "more": 1}, 422),
+        ({"format": "geojson", "parameters": {"derive": "perhaps"}}, 422), ({}, 422),
+    ):  # fmt: skip
+        api.problem("POST", path, status, json=bad)
+    assert "86400" in api.problem("POST", path, 422, json={"format": "geojson", "seconds": 90_000})["detail"]
+    api.problem("POST", f"environments/{bare}/versions/0/links", 422, json={"format": "tmap2"})
+    api.problem("POST", f"environments/{farm}/versions/77/links", 404, json=body)
+
+
+def test_link_does_not_outlive_the_token_of_its_creator(api: Api, farm: str) -> None:
+    ends = datetime.now(UTC) + timedelta(hours=1)
+    short = api.token_for("viewer", expires=ends.isoformat())
+    made = link(short, farm, format="geojson")
+    assert datetime.fromisoformat(made["expires"]) <= ends
+    left = datetime.fromisoformat(link(api, farm, format="geojson")["expires"]) - datetime.now(UTC)
+    assert timedelta(hours=23.9) < left <= timedelta(hours=24), "the default is the maximum"
+
+
+@pytest.fixture
+def strict(tmp_path: Path) -> Iterator[Api]:
+    with running(settings_for(tmp_path, token_failures=5)) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2()})
+        yield api
+
+
+def test_repeated_wrong_signatures_return_429(strict: Api) -> None:
+    nobody = strict.as_(None)
+    url = link(strict, "farm", format="geojson")["url"]
+    wrong = strict.as_("wrong-token")
+    for k in range(3):
+        nobody.problem("GET", altered(url, signature=f"x{k}"), 403)
+    for _ in range(2):
+        wrong.problem("GET", "formats", 401)
+    assert int(nobody("GET", altered(url, signature="y"), 429).headers["retry-after"]) > 0
+    wrong.problem("GET", "formats", 429)
+    assert nobody.get(url).content, "nobody guesses a genuine one"
+
+
+def test_links_of_before_a_rotation_stay_valid(strict: Api, tmp_path: Path) -> None:
+    nobody = strict.as_(None)
+    old = link(strict, "farm", format="geojson")["url"]
+    nobody.get(old)
+    strict.post("keys")
+    new = link(strict, "farm", format="geojson")["url"]
+    assert nobody.get(old).content == nobody.get(new).content
+    (tmp_path / "keys" / "links.json").unlink()
+    deadline = time.monotonic() + 30
+    while nobody.get(old, None).status_code == 200:  # what is in memory is good for a second
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    nobody.problem("GET", new, 403)
+
+
+def test_link_shows_a_signature_in_no_log_job_or_metric(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    with running(settings_for(tmp_path, log_level="debug")) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2()})
+        url = link(api, "farm", format="geojson")["url"]
+        signature = dict(parse_qsl(urlsplit(url).query))["signature"].partition(".")[2]
+        with httpx.Client() as client:
+            logging.getLogger("httpx").setLevel(logging.WARNING)
+            for query in ("", "x"):
+                client.get(api.url + url + query)
+        assert signature not in api.get("/metrics").text
+    assert signature not in "\n".join(r.getMessage() for r in caplog.records if not r.name.startswith("http"))
+
+
+def test_slow_map_by_link_returns_503_and_keeps_no_signature(tmp_path: Path) -> None:
+    with running(settings_for(tmp_path, job_seconds=0.001)) as api:
+        api.post("environments", {"name": "farm"})
+        api.upload("farm", {"datum.yaml": samples.DATUM, "n.tmap2.yaml": samples.tmap2()})
+        services = api.app.state.services
+        creator = services.access.check(f"Bearer {api.token}".encode(), None)
+        path = "/api/v1/environments/farm/versions/1/maps/geojson"
+        grant = services.links.create(services.store.environment("farm"), path, {"derive": "false"}, 600, creator)
+        nobody = api.as_(None)
+        answer = nobody("GET", grant.url, 503)
+        assert int(answer.headers["retry-after"]) > 0
+        assert "try again" in problem(answer)["detail"]
+        deadline = time.monotonic() + 60
+        while nobody.get(grant.url, None).status_code == 503:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        assert nobody.get(grant.url).content
+        with closing(sqlite3.connect(tmp_path / "fleetmap.sqlite3")) as database:
+            results = [row[0] for row in database.execute("select result from job")]
+        assert [json.loads(r) for r in results] == [{"location": f"{path}?derive=false"}]
+
+
+def test_link_works_without_access_control(tmp_path: Path) -> None:
+    with running(settings_for(tmp_path, insecure_no_auth=True, admin_token=None)) as api:
+        open_ = api.as_(None)
+        open_.post("environments", {"name": "farm"})
+        open_.upload("farm", {"datum.yaml": samples.DATUM})
+        url = link(open_, "farm", format="datum")["url"]
+        for _ in range(2):
+            open_.get(url)
+            open_.problem("GET", url, 403, headers={"Host": "evil.example"})
+        open_.problem("GET", altered(url, signature="x"), 403)
