@@ -288,17 +288,6 @@ def _entry(text: str, where: str, *, required: bool) -> _Entry:
     return _Entry(name, values, derive, closures, required)
 
 
-async def made_for(
-    here: Services, version: Version, name: str, values: dict[str, str], request: Request, who: Any
-) -> Made | Started:
-    """A version's map in a format, with these options; the job where it takes long."""
-    while True:
-        recipe: Recipe = await run_in_threadpool(here.maps.recipe, version, name, values)
-        made = await run_in_threadpool(here.maps.ready, recipe) or await _made(here, recipe, request, who)
-        if made is not None:
-            return made
-
-
 async def _made(here: Services, recipe: Recipe, request: Request, who: Any) -> Made | Started | None:
     """A map that is not ready, or the job that makes it. None where it cannot be derived so: the next recipe goes
     another way, or says that there is none.
