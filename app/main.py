@@ -433,7 +433,7 @@ async def _tick(here: Services) -> None:
             here.hot.count()
             await run_in_threadpool(here.store.apply_due, datetime.now(UTC))
             await run_in_threadpool(here.store.advance_rollouts, datetime.now(UTC), decide)
-            await run_in_threadpool(overlays.end_overlays, here, datetime.now(UTC))
+            await run_in_threadpool(here.store.end_due_overlays, datetime.now(UTC))
             if beat >= BEAT_SECONDS:
                 beat = 0.0
                 await run_in_threadpool(here.work.beat)

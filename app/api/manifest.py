@@ -20,7 +20,7 @@ from app.api.answers import Route, answer, json_bytes
 from app.api.caching import none_match
 from app.api.jobs import Started, started
 from app.api.maps import address_of, number_of, options_of
-from app.api.schemas import Closing, EnvironmentPath, KeyOut, ManifestOut, VersionPath, told
+from app.api.schemas import ClosuresQuery, EnvironmentPath, KeyOut, ManifestOut, VersionPath, told
 from app.api.services import Here, Services
 from app.convert import Recipe, site
 from app.convert.cache import Made
@@ -94,7 +94,7 @@ async def get_manifest(
             examples=["lanelet2"],
         ),
     ] = "",
-    closures: Closing = None,
+    closures: ClosuresQuery = None,
 ) -> Response:
     """Names, sizes and hashes of the files of maps, signed with the server's key over exactly these bytes.
 
@@ -228,7 +228,7 @@ def _recipe(here: Services, version: Version, entry: _Entry) -> Recipe:
     values = {**site.everything(formats.get_format(entry.format)), **entry.values}
     if entry.closures is not None:
         in_force = version.closures or here.store.closures(version.environment)
-        version = replace(version, closures=in_force.shown(entry.closures))
+        version = replace(version, closures=in_force.in_mode(entry.closures))
     return here.maps.recipe(version, entry.format, values, derive=entry.derive, listed=True)
 
 

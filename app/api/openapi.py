@@ -269,8 +269,8 @@ def _query_parameters() -> list[dict[str, Any]]:
     closures = {
         "name": "closures",
         "in": "query",
-        "description": "How the closures in force are shown: `apply` (closed edges are left out where the format's "
-        "planners know no word for them), `mark` or `ignore`. Default: `apply`, but `ignore` at a version's number.",
+        "description": "How the closures in force are shown: `apply` (closed edges are left out of formats that "
+        "cannot express a blocked edge), `mark` or `ignore`. Default: `apply`, but `ignore` at a version's number.",
         "schema": {"type": "string", "enum": list(CLOSURE_MODES)},
     }
     return [derive, closures, *(out[name] for name in sorted(out))]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -30,14 +29,13 @@ from app.api.schemas import (
 )
 from app.api.services import Here, Services
 from app.convert.cache import Made
-from app.errors import Conflict, Denied, FleetMapError, Invalid, MissingDatum, NotFound, Problem
+from app.convert.closures import place_problem
+from app.errors import Conflict, Denied, Invalid, NotFound, Problem
 from app.fleet import live, overlays
 from app.ingest.edits import shape_of
 from app.model.closures import Closures
 from app.model.frame import GROUND
 from app.store.values import Overlay, Version
-
-log = logging.getLogger(__name__)
 
 MAX_POINTS = 1000
 """Maximum number of points of a reported polygon: it goes to every robot in an event."""
@@ -63,12 +61,12 @@ def list_overlays(
     here: Here,
     _: Viewer,
     state: Annotated[
-        Literal["pending", "accepted", "rejected", "expired", "ended", "kept"] | None,
+        Literal["pending", "accepted", "rejected", "expired", "ended"] | None,
         Query(description="Only these; left out: all of the last 30 days. `accepted` are in force."),
     ] = None,
 ) -> Response:
     """Oldest first. `pending` waits for a decision, `accepted` is in force on every channel, `expired` was never
-    decided on, `ended` is over, `kept` was made permanent.
+    decided on, `ended` is over.
     """
     return answer([overlay.as_dict() for overlay in here.store.overlays(env, state)])
 
@@ -90,18 +88,13 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, here: Here, who: Rep
         raise Invalid("give polygon or edge, one of them", [Problem("one of polygon and edge", where="body")])
     if body.state == "accepted" and who.role not in ("editor", "admin"):
         raise Denied("only editors can accept an overlay: report it without state, an editor decides")
-    versions = _shown_versions(here, env)
-    head = next(versions)
+    versions = list(_shown_versions(here, env))
+    head = versions[0]
     now = datetime.now(UTC)
     crs = None if body.polygon is None else body.crs or ("wgs84" if head.datum else "local")
-    if crs == "wgs84" and head.datum is None:
-        raise MissingDatum(f"{env} has no datum, so degrees have no place in its maps: give the polygon in metres")
     level = body.level or GROUND
     if body.edge is not None:
-        level = overlays.edge_of(here.store, [head, *versions], body.edge)[0].level
-    elif level not in (names := [known.name for known in head.levels]):
-        listed = ", ".join(names)[:500]
-        raise Invalid(f"{env} has no level {level[:80]!r}; it has {listed}", [Problem("no such level", where="level")])
+        level = overlays.edge_of(here.store, versions, body.edge)[0].level
     reported = Overlay(
         environment=env,
         kind=body.kind,
@@ -117,6 +110,7 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, here: Here, who: Rep
         decided_by=who.name if body.state == "accepted" else None,
         decided=now if body.state == "accepted" else None,
     )
+    _check_place(reported, versions)
     overlay, new = here.store.add_overlay(reported)
     return answer(overlay.as_dict(), 201 if new else 200)
 
@@ -137,6 +131,16 @@ def _end_of(body: OverlayBody, now: datetime) -> datetime:
     if problem:
         raise Invalid(problem, [Problem(problem, where="body.expires")])
     return body.expires
+
+
+def _check_place(overlay: Overlay, versions: Iterable[Version]) -> None:
+    """Raise Invalid if an area has no place in any of the versions that robots may have."""
+    if overlay.polygon is None:
+        return
+    problems = [place_problem(overlay.closure, version) for version in versions]
+    if None not in problems:
+        problem = f"the polygon cannot be closed: {problems[0]}"
+        raise Invalid(problem, [Problem(str(problems[0]), where="polygon")])
 
 
 def _shown_versions(here: Services, env: str) -> Iterator[Version]:
@@ -169,8 +173,11 @@ def accept_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Edito
     overlay = here.store.overlay(env, id)
     if overlay.state == "pending" and overlay.expires <= now:
         raise Conflict(f"the overlay {id} has expired: report it again")
-    if overlay.state == "pending" and overlay.edge is not None:
-        overlays.edge_of(here.store, _shown_versions(here, env), overlay.edge)
+    if overlay.state == "pending":
+        versions = list(_shown_versions(here, env))
+        if overlay.edge is not None:
+            overlays.edge_of(here.store, versions, overlay.edge)
+        _check_place(overlay, versions)
     return answer(here.store.decide_overlay(env, id, "pending", "accepted", who.name, now).as_dict())
 
 
@@ -181,19 +188,16 @@ def reject_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Edito
     return answer(decided.as_dict())
 
 
-@router.post("/{id}/end", responses=told(OverlayOut, 404, 409, 503), summary="End an accepted overlay now")
+@router.post("/{id}/end", responses=told(OverlayOut, 404, 409), summary="End an accepted overlay now")
 def end_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
     """What it closed is free again on every channel."""
-    overlay = here.store.overlay(env, id)
-    if overlay.state == "accepted" and overlay.version is not None:
-        _lift(here, overlay, who.name)
     return answer(here.store.decide_overlay(env, id, "accepted", "ended", who.name, datetime.now(UTC)).as_dict())
 
 
 @router.post("/{id}/keep", responses=told(OverlayOut, 404, 409, 422, 503), summary="Make an accepted overlay permanent")
 def keep_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
-    """A new version holds it: an area as a keepout zone, an edge with `blocked: true`. Promote that version to bring it
-    to robots for good: the overlay itself ends here.
+    """A new version holds it: an area as a keepout zone, an edge with `blocked: true`. The overlay stays in force until
+    its end; promote the version before that to keep robots out for good.
     """
     overlay = here.store.overlay(env, id)
     if overlay.state != "accepted":
@@ -206,33 +210,7 @@ def keep_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor)
         author=who.name,
     )
     assert outcome.version is not None
-    number = outcome.version.number
-    kept = here.store.decide_overlay(env, id, "accepted", "kept", who.name, datetime.now(UTC), version=number)
-    return answer(kept.as_dict())
-
-
-def _lift(here: Services, overlay: Overlay, author: str) -> None:
-    """Take an overlay out of the newest version, into which a release before closures put it."""
-    what = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
-    here.ingest.amend(
-        overlay.environment,
-        partial(overlays.lifting_edits, here.store, overlay=overlay),
-        message=f"{what} is free again (reported by {overlay.reporter})",
-        author=author,
-    )
-
-
-def end_overlays(here: Services, now: datetime) -> None:
-    """End what is due: pending overlays expire, closures are lifted. Blocks."""
-    for overlay in here.store.end_due_overlays(now):
-        author = overlay.decided_by or ""
-        try:
-            _lift(here, overlay, author)
-            here.store.decide_overlay(overlay.environment, overlay.id, "accepted", "ended", author, now)
-        except Conflict:
-            continue  # another process was faster
-        except FleetMapError as error:
-            log.warning("overlays: %s of %s cannot be ended: %s", overlay.id, overlay.environment, error.detail)
+    return answer(here.store.note_kept_overlay(env, id, outcome.version.number).as_dict())
 
 
 # --- ready-made for planners that take closures live ---
@@ -241,7 +219,7 @@ def end_overlays(here: Services, now: datetime) -> None:
 @router.get("/nav2", responses=told(DynamicEdgesOut, 404, 409, 422), summary="Closures for Nav2's route server")
 async def nav2_edges(env: EnvironmentPath, request: Request, here: Here, who: Viewer, version: Ref = None) -> Response:
     """A request of `nav2_msgs/srv/DynamicEdges`: the numbers of closed edges, and of those that were closed and are
-    open again, in the graph that `maps/nav2_route?closures=ignore` (or `mark`) gives.
+    open again, in the graph that `maps/nav2_route?closures=mark` gives.
     """
     maps = await _marked(here, env, version, "nav2_route", request, who)
     if isinstance(maps, Started):
@@ -260,7 +238,7 @@ async def rmf_lanes(
     fleet: Annotated[str, Query(max_length=256, description="`fleet_name` of the messages.")] = "",
 ) -> Response:
     """Messages of `rmf_fleet_msgs/msg/LaneRequest`, one for each graph: lanes to close, and lanes that were closed and
-    are open again, by their indexes in the graphs that `maps/rmf_nav_graph?closures=ignore` (or `mark`) gives.
+    are open again, by their indexes in the graphs that `maps/rmf_nav_graph?closures=mark` gives.
     """
     maps = await _marked(here, env, version, "rmf_nav_graph", request, who)
     if isinstance(maps, Started):

@@ -947,7 +947,7 @@ class OverlayOut(BaseModel):
     id: str
     environment: str
     kind: Literal["blocked"]
-    state: Literal["pending", "accepted", "rejected", "expired", "ended", "kept"]
+    state: Literal["pending", "accepted", "rejected", "expired", "ended"]
     level: str
     reporter: str
     created: datetime
@@ -958,7 +958,7 @@ class OverlayOut(BaseModel):
     detail: str | None = None
     decided_by: str | None = None
     decided: datetime | None = None
-    version: int | None = Field(None, description="That made it permanent.")
+    version: int | None = Field(None, description="The version that made it permanent.")
 
 
 class DynamicEdgesOut(BaseModel):
@@ -1076,11 +1076,11 @@ FormatPath = Annotated[
 JobPath = Annotated[str, Path(max_length=100, description="A job's id.")]
 OverlayPath = Annotated[str, Path(max_length=100, description="An overlay's id.")]
 TokenPath = Annotated[str, Path(max_length=100, description="A token's id.")]
-Closing = Annotated[
+ClosuresQuery = Annotated[
     ClosureMode | None,
     Query(
-        description="How maps show the closures in force: `apply` (closed edges are left out where the format's "
-        "planners know no word for them), `mark` or `ignore`. Default: `apply`, but `ignore` for a version's number."
+        description="How maps show the closures in force: `apply` (closed edges are left out of formats that "
+        "cannot express a blocked edge), `mark` or `ignore`. Default: `apply`, but `ignore` for a version's number."
     ),
 ]
 LayerPath = Annotated[

@@ -6,24 +6,24 @@ are taken out of the network that a format is about to write, stored or derived.
 
 from __future__ import annotations
 
-import hashlib
+import threading
+from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import orjson
 import shapely
 import shapely.affinity
 import shapely.geometry
 from numpy.typing import NDArray
 
-from app.errors import MissingDatum
+from app.errors import FleetMapError
 from app.formats import Format
-from app.model.closures import Closure, ClosureMode, Closures
+from app.model.closures import Closure, ClosureMode, Closures, digest_of
 from app.model.features import Features, concatenate, features
-from app.model.frame import Anchor
-from app.model.geodesy import LocalFrame
+from app.model.frame import Anchor, Datum
+from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import FREE, OCCUPIED, OccupancyGrid
 from app.model.layers import Layers, Part, PartKey
 from app.store import Store
@@ -33,149 +33,122 @@ from app.store.values import Bounds, Box, PartEntry, Provenance, Version
 PART_NAME = "closures in force"
 KEEPOUT = "keepout"
 BLOCKED, UNTIL = "blocked", "blocked_until"
-MAX_CELLS = 2**28
 NO_EFFECT = "none"
+
+MAX_CELLS = 2**28
+MAX_METRES_FROM_DATUM = 100_000.0
+"""A closed area in degrees lies within this distance of the datum, in metres."""
+
 MAX_LISTED = 100
 """Maximum number of edges that a report lists for one closure."""
 
 
+# --- versions with closures ---
+
+
 def with_areas(version: Version) -> Version:
-    """A version with its closures' areas as further parts of the layer zones, one for each level."""
-    if version.closures is None or any(map(_is_ours, version.parts)):
+    """Add the closed areas to a version's parts, as one part of the layer zones for each level."""
+    if version.closures is None or not version.closures.items or any(map(_is_area_part, version.parts)):
         return version
-    entries = []
-    for key, areas in _areas(version).items():
-        rows = [closure.as_dict() for closure in areas]
-        digest = hashlib.sha256(orjson.dumps(rows, option=orjson.OPT_SORT_KEYS)).hexdigest()
-        zones = _zones(areas)
-        bounds: Bounds = {"local": _box(zones, zones.local), "wgs84": _box(zones, ~zones.local)}
-        steps = ({"step": "closures", "overlays": [closure.id for closure in areas]},)
-        entries.append(PartEntry(key, digest, len(areas), bounds, Provenance("raw", "closures", steps=steps)))
-    parts = tuple(sorted((*version.parts, *entries), key=lambda entry: entry.key))
-    return replace(version, parts=parts) if entries else version
+    entries = [_entry(key, areas) for key, areas in _areas(version).items()]
+    return replace(version, parts=tuple(sorted((*version.parts, *entries), key=lambda e: e.key)))
 
 
-def _box(zones: Features, chosen: NDArray[np.bool_]) -> Box | None:
-    if not chosen.any():
-        return None
-    west, south, east, north = shapely.total_bounds(zones.geometry[chosen]).tolist()
-    return west, south, east, north
+def without_areas(version: Version) -> Version:
+    """Take them out again: the version as it is stored."""
+    return replace(version, parts=tuple(entry for entry in version.parts if not _is_area_part(entry)))
 
 
 def load(store: Store, version: Version, keys: Collection[PartKey]) -> Layers:
-    """Load parts of a version, with its closures' areas and without marks that no longer count."""
-    closures = version.closures
-    if closures is None:
-        return store.load(version, keys)
-    areas = {key: closed for key, closed in _areas(version).items() if key in keys}
+    """Load parts of a version, with its closed areas and without marks that an earlier release put into versions."""
+    areas = {} if version.closures is None else {k: closed for k, closed in _areas(version).items() if k in keys}
     loaded = store.load(version, [key for key in keys if key not in areas])
-    parts: dict[PartKey, Part] = {key: _lifted(key, part, closures) for key, part in loaded.parts.items()}
-    parts |= {key: _zones(closed) for key, closed in areas.items()}
-    return replace(loaded, parts=parts)
+    parts: dict[PartKey, Part] = {**loaded.parts, **{key: _zones(closed) for key, closed in areas.items()}}
+    return without_timed_marks(replace(loaded, parts=parts), areas)
 
 
-def ingredients(version: Version, known: Format, keys: Collection[PartKey]) -> dict[str, Any]:
+def without_timed_marks(layers: Layers, areas: Collection[PartKey] = ()) -> Layers:
+    """Drop what is blocked until a time in the layers themselves: closures alone say what is blocked for a time.
+
+    Releases before closures put such marks into versions, and maps with closures in them may be uploaded again. areas:
+    parts that are closed areas.
+    """
+    return replace(
+        layers,
+        parts={
+            key: _without_timed_marks(part) if isinstance(part, Features) and key not in areas else part
+            for key, part in layers.parts.items()
+        },
+    )
+
+
+def _without_timed_marks(part: Features) -> Features:
+    timed = [UNTIL in p or ("overlay" in p and "expires" in p) for p in part.properties]
+    if not any(timed):
+        return part
+    kept = part.take([k for k, p in enumerate(part.properties) if not ("overlay" in p and "expires" in p)])
+    properties = tuple(
+        {name: value for name, value in p.items() if name not in (BLOCKED, UNTIL)} if UNTIL in p else p
+        for p in kept.properties
+    )
+    return replace(kept, properties=properties)
+
+
+def ingredients(version: Version, fmt: Format, keys: Collection[PartKey]) -> dict[str, Any]:
     """What a map's bytes depend on besides its parts; empty if no closure can change them."""
     closures = version.closures
     if closures is None:
         return {}
-    network = known.holds or "topology" in known.carries
-    masked = known.holds or any(key.layer == "occupancy" and key.name == KEEPOUT for key in keys)
+    network = fmt.holds or "topology" in fmt.carries
+    masked = fmt.holds or any(key.layer == "occupancy" and key.name == KEEPOUT for key in keys)
     out: dict[str, Any] = {}
     if closures.items and (network or masked):
         out["closures"] = closures.digest
     if network and closures.mode != "apply":
         out["closure_mode"] = closures.mode
-    if closures.lifted_edges or closures.lifted_zones:
-        out["lifted"] = [sorted(map(list, closures.lifted_edges)), sorted(closures.lifted_zones)]
     return out
 
 
-@dataclass(slots=True)
-class ClosureReport:
-    """What became of closures in one map. lines: one for each, for the report. left_out: edges that were taken out.
-    kept: blocked edges that stay in a map whose planners know no word for them.
-    """
-
-    lines: list[dict[str, Any]] = field(default_factory=list)
-    left_out: int = 0
-    kept: int = 0
-
-
-def close(
-    known: Format, layers: Layers, closures: Closures | None, drawn: Collection[PartKey]
-) -> tuple[Layers, ClosureReport]:
-    """Apply closures, and the network's own blocked edges, to the layers that a format is about to write.
-
-    drawn: parts that a derivation made of zones on the way: they hold the areas already.
-    """
-    report = ClosureReport()
-    mode: ClosureMode = "apply" if closures is None else closures.mode
-    mark = mode == "mark" or known.marks_blocked
-    items = () if closures is None else closures.items
-    effects: dict[str, dict[str, Any]] = {closure.id: {} for closure in items}
-    parts = dict(layers.parts)
-    for key, part in layers.parts.items():
-        if isinstance(part, Features) and key.layer == "topology":
-            parts[key] = _close_edges(key, part, items, layers.frame, mark=mark, effects=effects, report=report)
-        elif isinstance(part, OccupancyGrid) and key.name == KEEPOUT:
-            areas = [c for c in items if c.polygon is not None and c.level == key.level]
-            if key not in drawn and areas:
-                parts[key] = _burn(part, areas, layers.frame)
-            for area in areas:
-                effects[area.id]["cells"] = True
-        elif isinstance(part, Features) and key.layer == "zones" and key.name.startswith(PART_NAME):
-            for zone in part.properties:
-                effects[str(zone["overlay"]["id"])]["zone"] = True
-    if mark and not known.marks_blocked:
-        report.kept = sum(_is_blocked(p) for part in parts.values() if isinstance(part, Features)
-                          for p in part.properties)  # fmt: skip
-    report.lines = [_line(closure, effects[closure.id], mark=mark) for closure in items]
-    return replace(layers, parts=parts), report
-
-
-def merged_lines(reports: Iterable[Iterable[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Join the lines of several maps' reports: one line for each closure, with all its effects and edges."""
-    out: dict[str, dict[str, Any]] = {}
-    for line in (line for report in reports for line in report):
-        known = out.setdefault(line["id"], {**line})
-        effects = dict.fromkeys([known["effect"], line["effect"]])
-        known["effect"] = ", ".join(e for e in effects if e != NO_EFFECT) or NO_EFFECT
-        known["edges"] = list(dict.fromkeys([*known["edges"], *line["edges"]]))[:MAX_LISTED]
-        if known["effect"] != NO_EFFECT:
-            known.pop("why", None)
-    return list(out.values())
-
-
-def _line(closure: Closure, effect: Mapping[str, Any], *, mark: bool) -> dict[str, Any]:
-    """A report's line about one closure."""
-    edges: Sequence[str] = effect.get("edges", ())
-    did = [("marked" if mark else "left out") + f" {len(edges)} edges"] if edges else []
-    did += ["zone"] if effect.get("zone") else []
-    did += ["keepout cells"] if effect.get("cells") else []
-    line: dict[str, Any] = {"id": closure.id, "level": closure.level, "expires": closure.expires}
-    if closure.edge is not None:
-        line["edge"] = closure.edge
-    line |= {"effect": ", ".join(did) or NO_EFFECT, "edges": list(edges[:MAX_LISTED])}
-    if not did:
-        line["why"] = "this map has no such edge" if closure.edge is not None else "this map has nothing in that area"
-    return line
+def place_problem(closure: Closure, version: Version) -> str | None:
+    """Why a closed area has no place in a version; None if it has one."""
+    levels = [level.name for level in version.levels]
+    if closure.level not in levels:
+        return f"version {version.number} has no level {closure.level[:80]!r}; it has {', '.join(levels)[:500]}"
+    if closure.crs == "wgs84" and version.datum is None:
+        return f"version {version.number} has no datum, so degrees have no place in it"
+    try:
+        box = shapely.total_bounds(_zones([closure]).in_local(_frame(version.datum)))
+    except FleetMapError as error:
+        return error.detail
+    if closure.crs == "wgs84" and not (np.abs(box) <= MAX_METRES_FROM_DATUM).all():
+        return f"it reaches more than {MAX_METRES_FROM_DATUM / 1000:g} km from the datum"
+    return None
 
 
 # --- areas ---
 
+_placed: OrderedDict[tuple[str, Any, Any], list[Closure]] = OrderedDict()
+_placed_lock = threading.Lock()
+MAX_PLACED = 64
+
 
 def _areas(version: Version) -> dict[PartKey, list[Closure]]:
-    """The closures that are areas and have a place in a version, by the part that they become."""
-    assert version.closures is not None
-    levels = {level.name for level in version.levels}
-    taken = {entry.key for entry in version.parts if not _is_ours(entry)}
+    """The closed areas that have a place in a version, by the part that they become."""
+    closures = version.closures
+    if closures is None or not closures.items:
+        return {}
+    wanted = (closures.digest, version.levels, version.datum)
+    with _placed_lock:
+        chosen = _placed.get(wanted)
+    if chosen is None:
+        chosen = [c for c in closures.items if c.polygon is not None and place_problem(c, version) is None]
+        with _placed_lock:
+            _placed[wanted] = chosen
+            while len(_placed) > MAX_PLACED:
+                _placed.popitem(last=False)
+    taken = {entry.key for entry in version.parts if not _is_area_part(entry)}
     out: dict[PartKey, list[Closure]] = {}
-    for closure in version.closures.items:
-        if closure.polygon is None or closure.level not in levels:
-            continue
-        if closure.crs == "wgs84" and version.datum is None:
-            continue
+    for closure in chosen:
         key = PartKey("zones", closure.level, PART_NAME)
         while key in taken:
             key = replace(key, name=key.name + "'")
@@ -183,8 +156,23 @@ def _areas(version: Version) -> dict[PartKey, list[Closure]]:
     return out
 
 
-def _is_ours(entry: PartEntry) -> bool:
+def _is_area_part(entry: PartEntry) -> bool:
     return entry.key.layer == "zones" and entry.provenance.format == "closures"
+
+
+def _entry(key: PartKey, areas: Sequence[Closure]) -> PartEntry:
+    zones = _zones(areas)
+    bounds: Bounds = {"local": _box(zones, zones.local), "wgs84": _box(zones, ~zones.local)}
+    steps = ({"step": "closures", "overlays": [closure.id for closure in areas]},)
+    digest = digest_of([closure.as_dict() for closure in areas])
+    return PartEntry(key, digest, len(areas), bounds, Provenance("raw", "closures", steps=steps))
+
+
+def _box(zones: Features, chosen: NDArray[np.bool_]) -> Box | None:
+    if not chosen.any():
+        return None
+    west, south, east, north = shapely.total_bounds(zones.geometry[chosen]).tolist()
+    return west, south, east, north
 
 
 def _zones(areas: Sequence[Closure]) -> Features:
@@ -200,39 +188,115 @@ def _zones(areas: Sequence[Closure]) -> Features:
 def _zone(closure: Closure) -> tuple[str, Any, dict[str, Any]]:
     about = {"id": closure.id} | ({"detail": closure.detail} if closure.detail else {})
     properties = {"kind": KEEPOUT, "expires": closure.expires, "overlay": about}
-    return zone_id(closure.id), shapely.geometry.shape(closure.polygon), properties
+    return zone_id(closure.id), shapely.force_2d(shapely.geometry.shape(closure.polygon)), properties
 
 
-def _in_metres(closure: Closure, frame: LocalFrame | None) -> Any:
-    """A closed area in local metres. Raises MissingDatum."""
-    shape = shapely.geometry.shape(closure.polygon)
-    if closure.crs != "wgs84":
-        return shape
-    if frame is None:
-        raise MissingDatum("a closed area in degrees has no place without a datum")
-    one = np.empty(1, object)
-    one[0] = shape
-    return frame.geometries_to_local(one)[0]
+def _frame(datum: Datum | None) -> LocalFrame | None:
+    return None if datum is None else local_frame(datum)
+
+
+# --- maps ---
+
+
+@dataclass(slots=True)
+class ClosureReport:
+    """What closures did to one map.
+
+    lines: one for each closure with an effect. left_out: number of edges that were taken out. kept: number of blocked
+    edges that stay in a format that cannot express it. emptied: whether no edge would have been left.
+    """
+
+    lines: list[dict[str, Any]] = field(default_factory=list)
+    left_out: int = 0
+    kept: int = 0
+    emptied: bool = False
+
+
+def close(
+    fmt: Format, layers: Layers, closures: Closures | None, drawn: Collection[PartKey] = (), *, mark: bool = False
+) -> tuple[Layers, ClosureReport]:
+    """Apply closures, and the network's own blocked edges, to the layers that a format is about to write.
+
+    drawn: parts that a derivation made of zones on the way: they hold the areas already. mark: keep closed edges, with
+    a mark.
+    """
+    report = ClosureReport()
+    mode: ClosureMode = "apply" if closures is None else closures.mode
+    mark = mark or mode == "mark" or fmt.marks_blocked
+    items = () if closures is None else closures.items
+    effects: dict[str, _Effect] = {closure.id: _Effect() for closure in items}
+    zones = {zone_id(closure.id): closure.id for closure in items}
+    parts = dict(layers.parts)
+    for key, part in layers.parts.items():
+        if isinstance(part, Features) and key.layer == "topology":
+            parts[key] = _close_edges(key, part, items, layers.frame, mark=mark, effects=effects, report=report)
+        elif isinstance(part, OccupancyGrid) and key.name == KEEPOUT:
+            areas = [c for c in items if c.polygon is not None and c.level == key.level]
+            whole = True
+            if key not in drawn and areas:
+                parts[key], whole = _burn(part, areas, layers.frame)
+            for area in areas:
+                effects[area.id].cells = "keepout cells" if whole else "keepout cells (cut off at the mask's edge)"
+        elif isinstance(part, Features) and key.layer == "zones":
+            for overlay_id in (zones[i] for i in part.ids if i in zones):
+                effects[overlay_id].zone = True
+    if mark and not fmt.marks_blocked:
+        report.kept = sum(
+            _is_blocked(p) for part in parts.values() if isinstance(part, Features) for p in part.properties
+        )
+    report.lines = [line(c, effects[c.id], mark=mark) for c in items if effects[c.id].text(mark=mark) != NO_EFFECT]
+    return replace(layers, parts=parts), report
+
+
+@dataclass(slots=True)
+class _Effect:
+    """What one closure did to one map."""
+
+    edges: list[str] = field(default_factory=list)
+    zone: bool = False
+    cells: str = ""
+
+    def text(self, *, mark: bool) -> str:
+        edges = "1 edge" if len(self.edges) == 1 else f"{len(self.edges)} edges"
+        did = [("marked " if mark else "left out ") + edges] if self.edges else []
+        return ", ".join([*did, *(["zone"] if self.zone else []), *([self.cells] if self.cells else [])]) or NO_EFFECT
+
+
+def line(
+    closure: Closure, effect: _Effect | None = None, *, mark: bool = False, why: str | None = None
+) -> dict[str, Any]:
+    """A report's line about one closure. why: the reason for no effect."""
+    effect = effect or _Effect()
+    out: dict[str, Any] = {"id": closure.id, "level": closure.level, "expires": closure.expires}
+    if closure.edge is not None:
+        out["edge"] = closure.edge
+    out |= {"effect": effect.text(mark=mark), "edges": effect.edges[:MAX_LISTED]}
+    return out if why is None else {**out, "why": why}
+
+
+def report_lines(version: Version, stored: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """A line for each closure in force: the effect in a map's stored report, or why there is none."""
+    effects = {one["id"]: dict(one) for one in stored}
+    out = []
+    for closure in () if version.closures is None else version.closures.items:
+        why: str | None = "this map has no such edge"
+        if closure.edge is None:
+            why = place_problem(closure, version) or "this map has nothing that the area could close"
+        out.append(effects.get(closure.id) or line(closure, why=why))
+    return out
+
+
+def merged_lines(reports: Iterable[Iterable[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """Join the lines of several maps' reports: one line for each closure, with all its effects and edges."""
+    out: dict[str, dict[str, Any]] = {}
+    for one in (one for report in reports for one in report):
+        joined = out.setdefault(one["id"], {**one})
+        joined["effect"] = ", ".join(dict.fromkeys([joined["effect"], one["effect"]]))
+        joined["edges"] = list(dict.fromkeys([*joined["edges"], *one["edges"]]))[:MAX_LISTED]
+    return list(out.values())
 
 
 # --- networks ---
-
-
-def _lifted(key: PartKey, part: Part, closures: Closures) -> Part:
-    """A part without the marks of overlays that releases before closures put into versions."""
-    if not isinstance(part, Features):
-        return part
-    if key.layer == "zones" and closures.lifted_zones:
-        return part.take(np.array([i not in closures.lifted_zones for i in part.ids], bool))
-    if key.layer == "topology" and closures.lifted_edges:
-        properties = tuple(
-            {k: v for k, v in p.items() if k not in (BLOCKED, UNTIL)}
-            if (i, str(p.get(UNTIL))) in closures.lifted_edges
-            else p
-            for i, p in zip(part.ids, part.properties, strict=True)
-        )
-        return replace(part, properties=properties)
-    return part
 
 
 def _is_blocked(properties: Mapping[str, Any]) -> bool:
@@ -246,7 +310,7 @@ def _close_edges(
     frame: LocalFrame | None,
     *,
     mark: bool,
-    effects: Mapping[str, dict[str, Any]],
+    effects: Mapping[str, _Effect],
     report: ClosureReport,
 ) -> Features:
     """A network without its closed edges, or with a mark on them."""
@@ -254,12 +318,14 @@ def _close_edges(
     for closure, places in _closed(key, part, items, frame):
         for k in places:
             until[k] = max(until.get(k, ""), closure.expires)
-        effects[closure.id].setdefault("edges", []).extend(part.ids[k] for k in places)
+        effects[closure.id].edges += [part.ids[k] for k in places]
     if not mark:
-        gone = np.array([_is_blocked(p) for p in part.properties], bool)
-        gone[list(until)] = True
-        report.left_out += int(gone.sum())
-        return part.take(~gone) if gone.any() else part
+        blocked = np.array([_is_blocked(p) for p in part.properties], bool)
+        blocked[list(until)] = True
+        report.left_out += int(blocked.sum())
+        left = part.take(~blocked) if blocked.any() else part
+        report.emptied |= bool(blocked.any()) and not any(p.get("kind") == "edge" for p in left.properties)
+        return left
     if not until:
         return part
     # Drawing formats write a drawn line and leave out what was made of it: a marked edge speaks for itself.
@@ -287,31 +353,31 @@ def _closed(
         if k is not None and edges[k]:
             yield closure, [k]
     if areas and edges.any():
-        places, lines = _lines(part, np.flatnonzero(edges), frame)
+        places = np.flatnonzero(edges & part.local) if frame is None else np.flatnonzero(edges)
+        tree = shapely.STRtree(part.take(places).in_local(frame))
         for closure in areas:
             try:
                 area = _in_metres(closure, frame)
-            except MissingDatum:
-                continue
-            hit = shapely.intersects(lines, area)
-            if hit.any():
+            except FleetMapError:
+                continue  # without a place here, which the report says
+            hit = np.sort(tree.query(area, predicate="intersects"))
+            if len(hit):
                 yield closure, places[hit].tolist()
 
 
-def _lines(
-    part: Features, places: NDArray[np.intp], frame: LocalFrame | None
-) -> tuple[NDArray[np.intp], NDArray[np.object_]]:
-    """Edges in local metres, with their positions; without a frame those that are anchored so."""
-    if frame is None:
-        places = places[part.local[places]]
-    return places, part.take(places).in_local(frame)
+def _in_metres(closure: Closure, frame: LocalFrame | None) -> Any:
+    """A closed area in local metres. Raises MissingDatum."""
+    return _zones([closure]).in_local(frame)[0]
 
 
 # --- grids ---
 
 
-def _burn(grid: OccupancyGrid, areas: Sequence[Closure], frame: LocalFrame | None) -> OccupancyGrid:
-    """A stored keepout mask with closed areas occupied; it grows by free cells where an area reaches beyond it."""
+def _burn(grid: OccupancyGrid, areas: Sequence[Closure], frame: LocalFrame | None) -> tuple[OccupancyGrid, bool]:
+    """A stored keepout mask with closed areas occupied, and whether it holds all of them.
+
+    The mask grows by free cells if an area reaches beyond it, up to MAX_CELLS.
+    """
     from rasterio.features import rasterize
     from rasterio.transform import Affine
 
@@ -319,15 +385,23 @@ def _burn(grid: OccupancyGrid, areas: Sequence[Closure], frame: LocalFrame | Non
     cosine, sine, size = float(np.cos(yaw)), float(np.sin(yaw)), grid.resolution
     to_cells = [cosine / size, sine / size, -sine / size, cosine / size]
     shift = [-(x * cosine + y * sine) / size, (x * sine - y * cosine) / size]
-    shapes = [shapely.affinity.affine_transform(_in_metres(area, frame), [*to_cells, *shift]) for area in areas]
+    shapes = []
+    for area in areas:
+        try:
+            shapes.append(shapely.affinity.affine_transform(_in_metres(area, frame), [*to_cells, *shift]))
+        except FleetMapError:
+            continue  # without a place here, which the report says
+    if not shapes:
+        return grid, False
     left, bottom, right, top = shapely.total_bounds(np.array(shapes, object))
     before = (max(0, -int(np.floor(bottom))), max(0, -int(np.floor(left))))
     after = (max(0, int(np.ceil(top)) - grid.height), max(0, int(np.ceil(right)) - grid.width))
-    if (grid.height + before[0] + after[0]) * (grid.width + before[1] + after[1]) > MAX_CELLS:
+    fits = (grid.height + before[0] + after[0]) * (grid.width + before[1] + after[1]) <= MAX_CELLS
+    if not fits:
         before = after = (0, 0)
     cells = np.pad(grid.cells, ((before[0], after[0]), (before[1], after[1])), constant_values=FREE)
     here = Affine.translation(-before[1], -before[0])
     rasterize([(shape, OCCUPIED) for shape in shapes], out=cells, transform=here, all_touched=True)
     dx, dy = -before[1] * size, -before[0] * size
     origin = (round(x + dx * cosine - dy * sine, 9), round(y + dx * sine + dy * cosine, 9), yaw)
-    return replace(grid, cells=cells, origin=origin)
+    return replace(grid, cells=cells, origin=origin), fits

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from app import derive, formats
-from app.convert import closures as closing
+from app.convert import closures as applied_closures
 from app.convert import recipe as recipes
 from app.convert import site
 from app.convert.recipe import Chain, Hindrance, Spread
@@ -55,7 +55,7 @@ def make(
     """In a worker: a stored version's map. The parts are addressed by content, so no later change can mix in."""
     store = open_store(database_url, blob_dir)
     known = formats.get_format(name)
-    layers = closing.load(store, version, way.keys)
+    layers = applied_closures.load(store, version, way.keys)
     entries = {e.key: e for e in version.parts}
     templates, closures = version.templates, version.closures
     return write(known, layers, values, way, entries, templates=templates, closures=closures, spread=spread)
@@ -63,7 +63,7 @@ def make(
 
 def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) -> Hindrance | None:
     """In a worker: the step of a chain that fails on a version's content and why, or None where all work."""
-    layers = closing.load(open_store(database_url, blob_dir), version, way.keys)
+    layers = applied_closures.load(open_store(database_url, blob_dir), version, way.keys)
     try:
         derive.run(way.steps, layers)
     except CannotDerive as error:
@@ -76,7 +76,7 @@ def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) ->
 def lacking(database_url: str, blob_dir: str, version: Version, name: str, way: Chain) -> Hindrance | None:
     """In a worker: what a format wants of its layers besides that they are there, and they do not have, or None."""
     known = formats.get_format(name)
-    layers = closing.load(open_store(database_url, blob_dir), version, way.keys)
+    layers = applied_closures.load(open_store(database_url, blob_dir), version, way.keys)
     try:
         made = derive.run(way.steps, layers)
     except FleetMapError as error:
@@ -103,6 +103,8 @@ def write(
     """
     notes = derive.Notes()
     options = recipes.own_options(known, values)
+    if entries is None:  # of files; what is stored was loaded without them
+        layers = applied_closures.without_timed_marks(layers)
     source = _Source(layers, way, entries, origin, credit, templates, closures)
     if spread is None:
         return _written(known, derive.run(way.steps, layers, notes), options, source, notes)
@@ -168,13 +170,18 @@ def _written(known: Format, made: Layers, options: Any, source: _Source, notes: 
     credit, templates, closures = source.credit, source.templates, source.closures
     context = WriteContext(options=options)
     inner: list[dict[str, Any]] = []
+    inner_closures: list[list[dict[str, Any]]] = []
     if known.holds:
-        context.make = partial(_inner, entries, origin, credit, templates, closures, inner)
+        context.make = partial(_inner, entries, origin, credit, templates, closures, inner, inner_closures)
     chosen = known.choose(sorted(k for k in made.parts if k.layer in known.carries), context.options)
     used = Layers({k: made.parts[k] for k in chosen}, made.datum, made.levels)
-    closed = closing.ClosureReport()
+    closed = applied_closures.ClosureReport()
     if not known.holds:  # a folder's inner maps apply closures themselves
-        used, closed = closing.close(known, used, closures, made.parts.keys() - layers.parts.keys())
+        drawn = made.parts.keys() - layers.parts.keys()
+        applied, closed = applied_closures.close(known, used, closures, drawn)
+        if closed.emptied and _lacks_edges(known, applied):
+            applied, closed = applied_closures.close(known, used, closures, drawn, mark=True)
+        used = applied
     noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
     lines = _told(used, layers, way, entries or {}, origin or {}, noted)
     context.attribution = tuple(sorted(credits_of(lines)))  # whichever part came first: equal content, equal bytes
@@ -190,19 +197,23 @@ def _written(known: Format, made: Layers, options: Any, source: _Source, notes: 
         # What a stored version holds beside this map is not part of the recipe's key: ``Maps.report`` adds it.
         "dropped": notes.dropped + context.dropped + (not_carried(known, None, layers) if entries is None else []),
         "warnings": [p.as_dict() for p in notes.warnings + context.warnings],
-        "closures": closed.lines,
+        "closures": applied_closures.merged_lines([closed.lines, *inner_closures]),
     }
     return Written(files, report)
 
 
-def _report_blocked(known: Format, closed: closing.ClosureReport, context: WriteContext) -> None:
+def _lacks_edges(known: Format, layers: Layers) -> bool:
+    """Whether the format cannot be written without an edge."""
+    return known.lacks is not None and known.lacks(layers) is not None
+
+
+def _report_blocked(known: Format, closed: applied_closures.ClosureReport, context: WriteContext) -> None:
     """Report edges that nobody may use: those left out, and those that stay open to who plans on this map."""
-    context.drop("blocked edges", closed.left_out, f"nobody may use them, and {known.name} has no word for that")
+    context.drop("blocked edges", closed.left_out, f"{known.name} cannot mark an edge as blocked for its planners")
     if closed.kept:
-        context.warn(
-            f"{closed.kept} edges are blocked and stay in this map, because it was requested with closures=mark; "
-            f"planners of {known.name} use them unless they are told otherwise"
-        )
+        edges = "1 blocked edge stays" if closed.kept == 1 else f"{closed.kept} blocked edges stay"
+        why = "it was requested with closures=mark, or no edge would be left"
+        context.warn(f"{edges} in this map ({why}): planners of {known.name} use them unless closed otherwise")
 
 
 def from_layers(
@@ -241,6 +252,7 @@ def _inner(
     templates: Templates,
     closures: Closures | None,
     derivations: list[dict[str, Any]],
+    closed: list[list[dict[str, Any]]],
     name: str,
     layers: Layers,
     values: Mapping[str, Any],
@@ -254,6 +266,7 @@ def _inner(
     )
     report = made.report
     derivations += [line for line in report["layers"] if line["information"] == "derived"]
+    closed.append(report["closures"])
     return Inner(
         made.files,
         tuple(report["layers"]),

@@ -13,7 +13,7 @@ from typing import Any
 
 from app import formats, parameters, templates
 from app.bundle import Hints
-from app.convert import closures as closing
+from app.convert import closures as applied_closures
 from app.convert import files as direct
 from app.convert import make as making
 from app.convert import recipe as recipes
@@ -81,7 +81,7 @@ class Maps:
         wanted; its name may say more (``keepout.yaml`` is the grid keepout, ``L2/map.yaml`` the one of the level L2).
         listed: as in a manifest: files are named as those of the whole site, and no zip of them is made.
         """
-        version = closing.with_areas(version)
+        version = applied_closures.with_areas(version)
         known = formats.get_format(name)
         values = values or {}
         filled = templates.resolve(version.templates, known)
@@ -240,7 +240,8 @@ class Maps:
         stored = {e.key: e for e in recipe.version.parts}
         dropped = told["dropped"] + making.not_carried(recipe.format, stored, Layers())
         version, credit = recipe.version.number, making.credits_of(lines)
-        used = {k: why for k, why in recipe.version.stale.items() if k in recipe.chain.keys}
+        stored_version = applied_closures.without_areas(recipe.version)
+        used = {k: why for k, why in stored_version.stale.items() if k in recipe.chain.keys}
         stale = [
             {
                 "problem": f"it was derived from what has changed since ({', '.join(why)}): derive it anew",
@@ -252,7 +253,8 @@ class Maps:
         warnings = [*told["warnings"], *stale, *ignored]
         filled = making.labelled(told["template"], recipe.origin, recipe.version.templates)
         more = {"layers": lines, "attribution": credit, "template": filled, "dropped": dropped, "warnings": warnings}
-        return {**told, "version": version, **more}
+        closures = applied_closures.report_lines(recipe.version, told["closures"])
+        return {**told, "version": version, "closures": closures, **more}
 
     def _ignored(self, recipe: Recipe) -> list[str]:
         """What the environment's templates say and this release cannot use."""

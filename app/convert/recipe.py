@@ -15,7 +15,7 @@ from typing import Any
 import orjson
 
 from app import __version__, derive, formats, parameters, templates
-from app.convert import closures as closing
+from app.convert import closures as applied_closures
 from app.derive import Step
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingDatum, MissingLayer, Problem
 from app.formats import Format
@@ -391,7 +391,7 @@ def _key(
         "datum": version.datum.as_dict() if version.datum else None,
         "levels": [[level.name, level.elevation] for level in version.levels],
     }
-    ingredients |= closing.ingredients(version, known, way.keys)
+    ingredients |= applied_closures.ingredients(version, known, way.keys)
     if spread is not None:
         ingredients["spread"] = dataclasses.asdict(spread)
     if known.holds:  # its bytes are those of other writers and, where they lack a layer, of derivations

@@ -18,7 +18,7 @@ from typing import Any
 import orjson
 
 from app import derive
-from app.convert import closures as closing
+from app.convert import closures as applied_closures
 from app.convert import recipe as recipes
 from app.convert.recipe import Chain, Member, Recipe, Spread, Stock
 from app.derive import Derivation
@@ -376,7 +376,7 @@ def merged_report(reports: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str,
                 named = folder and isinstance(line, Mapping) and "file" in line
                 lines.append({**line, "file": folder + line["file"]} if named else line)
         out[member] = _once(lines)
-    out["closures"] = closing.merged_lines([report["closures"] for _, report in reports])
+    out["closures"] = applied_closures.merged_lines([report["closures"] for _, report in reports])
     return out
 
 

@@ -49,7 +49,11 @@ class Parameters:
     """How fine the masks are, and what speed limits are said in."""
 
     resolution: float | None = parameter(
-        None, "size of a cell; default: the map's, else 0.05 m", minimum=1e-3, maximum=1e3, unit="m"
+        None,
+        "size of a cell; default: the map's, else 0.05 m or coarser for large zones",
+        minimum=1e-3,
+        maximum=1e3,
+        unit="m",
     )
     speed_in: Literal["percent", "m/s"] | None = parameter(
         None, "what the cells of the speed mask stand for; default: m/s, or percent where every zone says percent"
@@ -178,12 +182,22 @@ def _frame(layers: Layers, level: str, shapes: list[Any], resolution: float | No
         corners = known.corners()
         low_high = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
     cell = resolution or (RESOLUTION if known is None else known.resolution)
+    if known is None and resolution is None:
+        cell = _coarse_enough(cell, low_high)
     first = [math.floor(v / cell + 1e-6) for v in low_high[:2]]
     end = [math.ceil(v / cell - 1e-6) for v in low_high[2:]]
     width, height = (max(1, b - a) for a, b in zip(first, end, strict=True))
     if width * height > MOST_CELLS:
         raise CannotConvert(f"a mask of {width} × {height} cells is too large: ask for a coarser resolution")
     return _Frame(round(first[0] * cell, 9), round(first[1] * cell, 9), cell, width, height)
+
+
+def _coarse_enough(cell: float, low_high: Any) -> float:
+    """Double the size of a cell until a mask of this extent has a bearable number of cells."""
+    width, height = float(low_high[2] - low_high[0]), float(low_high[3] - low_high[1])
+    while (width / cell) * (height / cell) > MOST_CELLS / 4:
+        cell *= 2.0
+    return cell
 
 
 def _report_outside(zones: list[_Zone], frame: _Frame, level: str, notes: Notes) -> None:

@@ -1,4 +1,4 @@
-"""Overlays as edits of a version: making a closure permanent, and undoing what releases before closures wrote."""
+"""Overlays as edits of a version: making a closure permanent."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from app.model.features import Feature
 from app.model.layers import PartKey
 from app.store import Store
 from app.store.overlays import zone_id
-from app.store.values import Overlay, Version, rfc3339
+from app.store.values import Overlay, Version
 
 BLOCKED, UNTIL = "blocked", "blocked_until"
 
@@ -32,24 +32,6 @@ def permanent_edits(store: Store, head: Version, overlay: Overlay) -> list[dict[
     properties = {"kind": "keepout", "overlay": about}
     feature = {"type": "Feature", "id": zone_id(overlay.id), "geometry": overlay.polygon, "properties": properties}
     return [{"op": "put", "layer": "zones", "level": overlay.level, "crs": overlay.crs, "feature": feature}]
-
-
-def lifting_edits(store: Store, head: Version, overlay: Overlay) -> list[dict[str, Any]]:
-    """Edits that take an overlay out of the newest version, into which a release before closures put it.
-
-    None if that is done already, or the edge is blocked for longer.
-    """
-    if overlay.edge is not None:
-        try:
-            key, edge = edge_of(store, [head], overlay.edge)
-        except Invalid:
-            return []
-        if edge.properties.get(UNTIL) != rfc3339(overlay.expires):
-            return []
-        return [_put(key, edge, {k: v for k, v in edge.properties.items() if k not in (BLOCKED, UNTIL)})]
-    zone = zone_id(overlay.id)
-    keys = [e.key for e in head.parts if e.key.layer == "zones" and store.has_ids(head, e.key, [zone])]
-    return [{"op": "delete", "layer": "zones", "level": k.level, "name": k.name, "id": zone} for k in keys]
 
 
 def edge_of(store: Store, versions: Iterable[Version], edge: str) -> tuple[PartKey, Feature]:

@@ -192,8 +192,8 @@ class Format:
     those is a main file itself. lacking: what a file needs that may be such a map but does not say enough by itself (a
     picture without a place); empty for other files. completing: the read options that say it.
     looks_at: files of other maps of the upload that it looks into. parts: the options that select a stored part, for
-    formats whose files hold one part each. holds: it is a folder of other formats' maps. marks_blocked: who reads it
-    knows a word for an edge that nobody may use, so that such an edge stays in it; other formats leave it out.
+    formats whose files hold one part each. holds: it is a folder of other formats' maps. marks_blocked: it can
+    express a blocked edge, so that such an edge stays in it; other formats leave it out.
     """
 
     name: str

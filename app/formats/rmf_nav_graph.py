@@ -529,9 +529,8 @@ class _Writer:
                     out.setdefault(graph, []).append(_Edge(i, source, target, p))
         for edges in out.values():
             edges.sort(key=lambda e: e.order)
-            apart = {frozenset((e.source, e.target)) for e in edges if e.p.get("blocked") is True}
             for e, paired in zip(edges, _paired(edges, len(places)), strict=True):
-                e.paired = paired and frozenset((e.source, e.target)) not in apart
+                e.paired = paired
         return out
 
     # a graph
@@ -601,13 +600,14 @@ class _Writer:
 
     def _lanes(self, storey: _Storey, graph: int, edges: Sequence[_Edge], place: Mapping[int, int]) -> Iterator[str]:
         crossed = self._crossed(storey, edges)
+        blocked = {(e.source, e.target) for e in edges if e.p.get("blocked") is True}
         for n, e in enumerate(edges):
             if own(e.p, NAME).get("reverse") is True and e.paired:
                 continue  # it is told by the lane that says is_bidirectional
             more = "".join(f", {self.flow(v)}" for v in own(e.p, NAME).get("more") or ())
             said = self._lane(storey, e, crossed[n])
-            if e.p.get("blocked") is True:
-                said["blocked"] = True
+            if e.p.get("blocked") is True or (said.get("is_bidirectional") is True and (e.target, e.source) in blocked):
+                said["blocked"] = True  # a lane counts as one, whichever direction is closed
             yield f"      - [{place[e.source]}, {place[e.target]}, {self.flow(said)}{more}]\n"
         for row in mapping(storey.document.get("dangling"), "dangling").get(str(graph), ()):
             if all(0 <= v < len(place) for v in row[:2]):

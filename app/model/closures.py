@@ -1,4 +1,4 @@
-"""Closures: edges and areas that nobody may use for a time, on every channel. They are no part of a version."""
+"""Closures: overlays in force. Edges and areas that no robot may use for a time, on every channel, in no version."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 ClosureMode = Literal["apply", "mark", "ignore"]
-"""How a map shows closures. ``apply``: closed edges are left out where the format's planners know no word for them.
-``mark``: closed edges stay and are marked. ``ignore``: the map is the version's alone.
+"""How a map shows closures. ``apply``: closed edges are left out of formats that cannot express a blocked edge.
+``mark``: closed edges stay and are marked. ``ignore``: the map is the version's, whatever is in force.
 """
 CLOSURE_MODES: tuple[ClosureMode, ...] = get_args(ClosureMode)
 
@@ -47,22 +47,19 @@ class Closure:
 class Closures:
     """The closures in force in an environment, sorted by id, and how a map shows them.
 
-    lifted_edges, lifted_zones: marks that releases before closures put into versions, which count no longer: (edge id,
-    its ``blocked_until``) and ids of zones.
+    digest: SHA-256 (hex) of the list: robots with equal roots and equal digests hold the same map.
     """
 
     items: tuple[Closure, ...] = ()
     mode: ClosureMode = "apply"
-    lifted_edges: frozenset[tuple[str, str]] = frozenset()
-    lifted_zones: frozenset[str] = frozenset()
+    digest: str = ""
 
-    @property
-    def digest(self) -> str:
-        """SHA-256 (hex) of the list: robots with equal roots and equal digests hold the same map."""
-        return digest_of([closure.as_dict() for closure in self.items])
+    def __post_init__(self) -> None:
+        if not self.digest:
+            object.__setattr__(self, "digest", digest_of([closure.as_dict() for closure in self.items]))
 
-    def shown(self, mode: ClosureMode) -> Closures | None:
-        """The same in another mode; None where they are ignored."""
+    def in_mode(self, mode: ClosureMode) -> Closures | None:
+        """The same, shown in another way; None if they are ignored."""
         return None if mode == "ignore" else replace(self, mode=mode)
 
 

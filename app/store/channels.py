@@ -93,7 +93,7 @@ class Channels(Base):
             found, sequence = read_version(connection, row, number), int(sequence or 0)
             if mode == "ignore":
                 return found, sequence
-            in_force = closures_in_force(connection, row).shown(mode)
+            in_force = closures_in_force(connection, row).in_mode(mode)
             return replace(found, closures=in_force), max(sequence, int(row.closures_sequence))
 
     def set_channel(

@@ -90,11 +90,9 @@ class Collection(Base):
             silent = now - timedelta(days=ROBOT_DAYS)
             for table in (tables.robot, tables.robot_history, tables.presence):
                 connection.execute(delete(table).where(table.c.time < silent))
-            decided = tables.overlay.c.state.in_(("rejected", "expired", "ended", "kept"))
+            decided = tables.overlay.c.state.in_(("rejected", "expired", "ended"))
             old = tables.overlay.c.decided < now - timedelta(days=OVERLAY_DAYS)
-            # What a release before closures put into a version is lifted from its maps for as long as it is listed.
-            marked = (tables.overlay.c.state == "ended") & tables.overlay.c.version.is_not(None)
-            connection.execute(delete(tables.overlay).where(decided, old, ~marked))
+            connection.execute(delete(tables.overlay).where(decided, old))
             finished = jobs.c.state.in_(("done", "failed", "cancelled"))
             connection.execute(delete(jobs).where(finished, jobs.c.updated < now - timedelta(days=JOB_DAYS)))
             connection.execute(

@@ -6,7 +6,10 @@ manifest is ordered by.
 
 from __future__ import annotations
 
+import json
 import secrets
+import threading
+from collections import OrderedDict
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import datetime
@@ -19,7 +22,7 @@ from app.event_types import EventType
 from app.model.closures import Closures
 from app.store import outbox, tables
 from app.store.base import Base, environment_row, text
-from app.store.values import Overlay, OverlayState, rfc3339
+from app.store.values import Overlay, OverlayState
 
 MAX_PENDING: Final = 1000
 """Maximum number of an environment's overlays that wait for a decision."""
@@ -30,12 +33,14 @@ MAX_OF_ONE: Final = 100
 MAX_IN_FORCE: Final = 1000
 """Maximum number of closures of an environment: every manifest lists them."""
 
+MAX_IN_FORCE_BYTES: Final = 2**21
+"""Maximum size of their areas as JSON, together."""
+
 MAX_LISTED: Final = 10_000
 EVENTS: Final[Mapping[OverlayState, EventType]] = {
     "accepted": "overlay.accepted",
     "rejected": "overlay.rejected",
     "ended": "overlay.ended",
-    "kept": "overlay.ended",
 }
 """The event of each decision."""
 
@@ -60,7 +65,7 @@ class Overlays(Base):
         with self._database.write() as connection:
             row = environment_row(connection, overlay.environment, lock=True)
             if accepted:
-                _require_room(connection, row)
+                _require_room(connection, row, overlay)
             elif (same := _pending_twin(connection, row, overlay)) is not None:
                 values = {"expires": overlay.expires, "detail": overlay.detail}
                 connection.execute(update(table).where(table.c.id == same).values(values))
@@ -119,13 +124,8 @@ class Overlays(Base):
         state: OverlayState,
         author: str,
         now: datetime,
-        *,
-        version: int | None = None,
     ) -> Overlay:
-        """Change an overlay's state, with the event of it. Raises Conflict if it is not in the state ``before``.
-
-        version: the one that made it permanent.
-        """
+        """Change an overlay's state, with the event of it. Raises Conflict if it is not in the state ``before``."""
         table = tables.overlay
         with self._database.write() as connection:
             row = environment_row(connection, environment, lock=True)
@@ -133,25 +133,19 @@ class Overlays(Base):
             if stored.state != before:
                 raise Conflict(f"the overlay {id} is {stored.state}, not {before}")
             if state == "accepted":
-                _require_room(connection, row)
+                _require_room(connection, row, stored)
             values: dict[str, Any] = {"state": state, "decided_by": text(author, "an author"), "decided": now}
-            if version is not None:
-                values["version"] = version
             connection.execute(update(table).where(table.c.id == id).values(values))
             decided = _read(connection, row, id)
             if (event := EVENTS.get(state)) is not None:
                 _append_event(connection, row, decided, event, author, now)
             return decided
 
-    def end_due_overlays(self, now: datetime) -> list[Overlay]:
-        """End what is due: pending overlays expire, closures are lifted, each with its event.
-
-        Returns the due overlays that a release before closures put into a version: the caller takes them out of it and
-        ends them with ``decide_overlay``.
-        """
+    def end_due_overlays(self, now: datetime) -> None:
+        """End what is due: pending overlays expire, closures are lifted, each with its event."""
         table, owner = tables.overlay, tables.environment
         query = (
-            select(table, owner.c.name.label("environment"))
+            select(table.c.id, table.c.state, owner.c.name.label("environment"))
             .join(owner, owner.c.id == table.c.environment_id)
             .where(table.c.expires <= now, table.c.state.in_(("pending", "accepted")), owner.c.deleted.is_(None))
             .order_by(table.c.expires, table.c.id)
@@ -159,10 +153,7 @@ class Overlays(Base):
         )
         with self._database.read() as connection:
             due = connection.execute(query).all()
-        in_version = [r for r in due if r.state == "accepted" and r.version is not None]
         for found in due:
-            if found in in_version:
-                continue
             with suppress(NotFound), self._database.write() as connection:
                 row = environment_row(connection, found.environment, lock=True)
                 stored = _read(connection, row, found.id)
@@ -171,24 +162,44 @@ class Overlays(Base):
                 state: OverlayState = "expired" if stored.state == "pending" else "ended"
                 event: EventType = "overlay.expired" if stored.state == "pending" else "overlay.ended"
                 connection.execute(update(table).where(table.c.id == found.id).values(state=state, decided=now))
-                author = stored.decided_by or ""
-                _append_event(connection, row, _read(connection, row, found.id), event, author, now)
-        return [_as_overlay(r.environment, r) for r in in_version]
+                _append_event(connection, row, _read(connection, row, found.id), event, stored.decided_by or "", now)
+
+    def note_kept_overlay(self, environment: str, id: str, version: int) -> Overlay:
+        """Record the version that made an overlay permanent. It stays in force until its end."""
+        table = tables.overlay
+        with self._database.write() as connection:
+            row = environment_row(connection, environment, lock=True)
+            connection.execute(update(table).where(table.c.id == id).values(version=version))
+            return _read(connection, row, id)
+
+
+_known: OrderedDict[tuple[str, int], Closures] = OrderedDict()
+_known_lock = threading.Lock()
+MAX_KNOWN: Final = 256
 
 
 def closures_in_force(connection: Connection, environment: Row[Any]) -> Closures:
-    """Read the closures in force of an environment, in the caller's transaction."""
+    """Read the closures in force of an environment, in the caller's transaction.
+
+    They are cached by the sequence of the event that changed them last, which the environment's row has.
+    """
+    key = (str(environment.id), int(environment.closures_sequence))
+    with _known_lock:
+        known = _known.get(key)
+    if known is None:
+        known = _read_closures(connection, environment)
+        with _known_lock:
+            _known[key] = known
+            while len(_known) > MAX_KNOWN:
+                _known.popitem(last=False)
+    return known
+
+
+def _read_closures(connection: Connection, environment: Row[Any]) -> Closures:
     table = tables.overlay
-    query = select(table).where(
-        table.c.environment_id == environment.id, (table.c.state == "accepted") | table.c.version.is_not(None)
-    )
-    overlays = [_as_overlay(environment.name, r) for r in connection.execute(query.order_by(table.c.id))]
-    marked = [o for o in overlays if o.version is not None and o.state != "kept"]
-    return Closures(
-        tuple(o.closure for o in overlays if o.state == "accepted"),
-        lifted_edges=frozenset((o.edge, rfc3339(o.expires)) for o in marked if o.edge is not None),
-        lifted_zones=frozenset(zone_id(o.id) for o in marked if o.polygon is not None),
-    )
+    query = select(table).where(table.c.environment_id == environment.id, table.c.state == "accepted")
+    rows = connection.execute(query.order_by(table.c.id))
+    return Closures(tuple(_as_overlay(environment.name, row).closure for row in rows))
 
 
 def zone_id(overlay_id: str) -> str:
@@ -196,11 +207,15 @@ def zone_id(overlay_id: str) -> str:
     return f"overlay-{overlay_id}"
 
 
-def _require_room(connection: Connection, environment: Row[Any]) -> None:
+def _require_room(connection: Connection, environment: Row[Any], overlay: Overlay) -> None:
+    """Raise Conflict if another closure would make manifests too large."""
     table = tables.overlay
-    in_force = (table.c.environment_id == environment.id, table.c.state == "accepted")
-    if connection.execute(select(func.count()).select_from(table).where(*in_force)).scalar_one() >= MAX_IN_FORCE:
-        raise Conflict(f"{MAX_IN_FORCE} overlays of {environment.name} are in force: end or keep some first")
+    in_force = select(table.c.polygon).where(table.c.environment_id == environment.id, table.c.state == "accepted")
+    polygons = [row.polygon for row in connection.execute(in_force)]
+    size = sum(len(json.dumps(polygon)) for polygon in [*polygons, overlay.polygon])
+    if len(polygons) >= MAX_IN_FORCE or size > MAX_IN_FORCE_BYTES:
+        reason = f"{MAX_IN_FORCE} overlays" if len(polygons) >= MAX_IN_FORCE else f"{MAX_IN_FORCE_BYTES} bytes of areas"
+        raise Conflict(f"{reason} of {environment.name} are in force: end or keep some first, or send simpler outlines")
 
 
 def _pending_twin(connection: Connection, environment: Row[Any], overlay: Overlay) -> str | None:
@@ -231,7 +246,7 @@ def _append_event(
     more: dict[str, Any] = {"overlay": overlay.as_dict()}
     if event in CHANGE_CLOSURES:
         values["closures_sequence"] = sequence
-        more["overlays_digest"] = closures_in_force(connection, environment).digest
+        more["overlays_digest"] = _read_closures(connection, environment).digest
     connection.execute(update(owner).where(owner.c.id == environment.id).values(values))
     what = f"edge {overlay.edge}" if overlay.edge is not None else "a polygon"
     outbox.append(

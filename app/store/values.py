@@ -522,7 +522,7 @@ class Move:
 NO_ROOT: Final = "0" * 64
 """Root that a robot without a map reports."""
 
-OverlayState = Literal["pending", "accepted", "rejected", "expired", "ended", "kept"]
+OverlayState = Literal["pending", "accepted", "rejected", "expired", "ended"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -530,8 +530,8 @@ class Overlay:
     """Something that is blocked until ``expires``: a GeoJSON polygon in ``crs``, or an edge by its id.
 
     state: ``pending`` until an editor accepts or rejects it or its time is over (``expired``). An accepted one is in
-    force on every channel until it has ``ended``, or was made permanent by ``version`` (``kept``). Releases before
-    closures put accepted ones into a version: those have a ``version`` in every state.
+    force on every channel until it has ``ended``. version: the one that made it permanent, or into which a release
+    before closures put it.
     """
 
     environment: str

@@ -229,18 +229,17 @@ def test_live_requests_for_planners(api: Api, farm: str) -> None:
     url = f"environments/{farm}/overlays"
     closure = close(api, farm, edge="gate_barn")
     area = close(api, farm, polygon=SQUARE, crs="local")
-    graph = api.get(f"environments/{farm}/versions/production/maps/nav2_route?closures=ignore").json()["features"]
-    names = {f["id"]: f["properties"]["id"] for f in graph if "id" in f}
+    graph = api.get(f"environments/{farm}/versions/production/maps/nav2_route?closures=mark").json()["features"]
     marked = api.get(f"{url}/nav2").json()
     assert len(marked["closed_edges"]) == 2
     assert marked["opened_edges"] == []
-    del names
+    assert set(marked["closed_edges"]) <= {f["properties"]["id"] for f in graph if "startid" in f["properties"]}
     lanes = api.get(f"{url}/rmf?fleet=mowers").json()["requests"]
     assert lanes == [
         {"graph": "0.yaml", "message": {"fleet_name": "mowers", "open_lanes": [], "close_lanes": lanes[0]["message"][
             "close_lanes"]}}
     ]  # fmt: skip
-    whole = yaml.safe_load(api.get(f"/maps/{farm}/rmf_nav_graph?closures=ignore").text)["levels"]
+    whole = yaml.safe_load(api.get(f"/maps/{farm}/rmf_nav_graph?closures=mark").text)["levels"]
     (level,) = whole.values()
     ends = [level["lanes"][k][:2] for k in lanes[0]["message"]["close_lanes"]]
     named = [[level["vertices"][v][2]["name"] for v in pair] for pair in ends]
@@ -278,3 +277,97 @@ def test_closures_are_listed_with_their_ends_as_signed(api: Api, farm: str) -> N
     listed = json.loads(body)
     assert listed["overlays_digest"] == digest_of(listed["overlays"])
     assert listed["overlays"][0]["polygon"] == json.loads(json.dumps(SQUARE))
+
+
+def test_closing_the_last_edge_marks_it_where_a_graph_must_have_one(api: Api, fresh: Any) -> None:
+    """A manifest that cannot be made would leave robots on the open network."""
+    env = fresh()
+    api.post("environments", {"name": env})
+    api.upload(env, {"n.tmap2.yaml": samples.tmap2(edges=(("gate", "barn"),))})
+    close(api, env, edge="gate_barn")
+    assert edges(api.get(f"/maps/{env}/tmap2").text) == set()
+    graph = api.get(f"/maps/{env}/nav2_route").json()["features"]
+    (only,) = [f["properties"] for f in graph if "startid" in f["properties"]]
+    assert only["metadata"]["blocked"] is True
+    report = api.get(f"environments/{env}/versions/latest/reports/nav2_route").json()
+    assert any("no edge would be left" in w["problem"] for w in report["warnings"])
+    api.get(f"environments/{env}/versions/latest/manifest?formats=nav2_route,tmap2,rmf_nav_graph")
+
+
+def test_reports_name_the_closures_of_their_own_environment(api: Api, farm: str, fresh: Any) -> None:
+    """Maps are cached by content, and closures often change no bytes of them."""
+    other = fresh()
+    api.post("environments", {"name": other, "clone": {"environment": farm, "version": 3}})
+    closure = close(api, farm, edge="gate_barn")
+    place = "environments/{}/versions/latest/reports/occupancy_grid"
+    (line,) = api.get(place.format(farm)).json()["closures"]
+    assert (line["id"], line["effect"], line["why"]) == (closure["id"], "none", "this map has no such edge")
+    assert api.get(place.format(other)).json()["closures"] == []
+    end(api, farm, closure)
+    assert api.get(place.format(farm)).json()["closures"] == []
+
+
+def test_map_with_closures_that_is_uploaded_again_makes_nothing_permanent(api: Api, farm: str) -> None:
+    promote(api, farm, 3)
+    closures = [close(api, farm, edge="barn_field"), close(api, farm, polygon=SQUARE, crs="local")]
+    exported = api.get(f"/maps/{farm}/geojson").content
+    api.upload(farm, {"map.geojson": exported}, layer="topology")
+    for closure in closures:
+        end(api, farm, closure)
+    for name in ("geojson", "kml", "tmap2"):
+        text = api.get(f"environments/{farm}/versions/latest/maps/{name}").text
+        assert "overlay-" not in text, name
+        assert "blocked_until" not in text, name
+    assert len(edges(api.get(f"environments/{farm}/versions/latest/maps/tmap2").text)) == 3
+
+
+def test_zones_may_be_called_like_the_closed_areas(api: Api, farm: str) -> None:
+    ring = [[1, 1], [2, 1], [2, 2], [1, 1]]
+    zone = {"type": "Feature", "id": "z", "properties": {"kind": "keepout"},
+            "geometry": {"type": "Polygon", "coordinates": [ring]}}  # fmt: skip
+    put = {"op": "put", "layer": "zones", "name": "closures in force", "crs": "local", "feature": zone}
+    api.post(f"environments/{farm}/edits", {"changes": [put]})
+    closure = close(api, farm, polygon=SQUARE, crs="local")
+    listed = {f["id"] for f in api.get(f"/maps/{farm}/geojson").json()["features"]}
+    assert {"z", f"overlay-{closure['id']}"} <= listed
+    assert "z" in api.get(f"/maps/{farm}/geojson?closures=ignore").text
+
+
+def test_robots_get_the_mask_of_a_closed_area_with_the_whole_site(api: Api, fresh: Any) -> None:
+    """Also on a level without a mask of its own, beside a stored mask on another level."""
+    env = fresh()
+    api.post("environments", {"name": env})
+    for level in ("ground", "L2"):
+        api.upload(env, samples.grid(), level=level)
+    api.upload(env, samples.grid("keepout"), level="ground", grid="keepout")
+    place = f"environments/{env}/versions/latest/manifest?formats=occupancy_grid"
+    before = {f["name"]: f["sha256"] for f in api.get(place).json()["files"]}
+    ring = [[0, -1], [1, -1], [1, 0], [0, -1]]
+    area = {"polygon": {"type": "Polygon", "coordinates": [ring]}, "crs": "local"}
+    close(api, env, level="L2", **area)
+    after = {f["name"]: f["sha256"] for f in api.get(place).json()["files"]}
+    assert {name for name in after if name not in before} == {"L2/keepout.yaml", "L2/keepout.pgm",
+                                                              "L2/keepout_filter_info.yaml"}  # fmt: skip
+    assert {name: after[name] for name in before} == before
+    assert (pgm(api.get(f"/maps/{env}/occupancy_grid/L2/keepout.pgm").content) == 0).any()
+    close(api, env, level="ground", **area)
+    last = {f["name"]: f["sha256"] for f in api.get(place).json()["files"]}
+    assert {name for name in last if last[name] != after[name]} == {"keepout.pgm"}
+
+
+def test_folder_report_lists_what_closures_did_inside(api: Api, farm: str) -> None:
+    closure = close(api, farm, edge="gate_barn")
+    (line,) = api.get(f"environments/{farm}/versions/latest/reports/environment").json()["closures"]
+    assert (line["id"], line["edges"]) == (closure["id"], ["gate_barn"])
+
+
+def test_large_area_keeps_the_mask_of_a_site_without_a_map(api: Api, bare: str) -> None:
+    ring = [[0, 0], [2, 0], [2, 2], [0, 2], [0, 0]]
+    zone = {"type": "Feature", "id": "z", "properties": {"kind": "keepout"},
+            "geometry": {"type": "Polygon", "coordinates": [ring]}}  # fmt: skip
+    put = {"op": "put", "layer": "zones", "crs": "local", "feature": zone}
+    api.post(f"environments/{bare}/edits", {"changes": [put]})
+    wide = [[0, 0], [1500, 0], [1500, 1500], [0, 1500], [0, 0]]
+    close(api, bare, polygon={"type": "Polygon", "coordinates": [wide]}, crs="local")
+    size = yaml.safe_load(api.get(f"/maps/{bare}/occupancy_grid/keepout.yaml").content)["resolution"]
+    assert 0.05 < size < 1.0

@@ -62,7 +62,7 @@ def test_blocked_edge_stays_with_a_warning_when_marked(name: str) -> None:
     written = made(name, network(blocked=True), "mark")
     assert edges_in(name, written.files) == {("a", "b"), ("b", "a")}
     (warning,) = [w["problem"] for w in written.report["warnings"] if "blocked" in w["problem"]]
-    assert warning.startswith("1 edges are blocked")
+    assert warning.startswith("1 blocked edge stays")
     assert name in warning
 
 

@@ -7,12 +7,11 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
-from sqlalchemy import update
 
 from app.errors import Conflict, NotFound
 from app.model.closures import NO_CLOSURES
-from app.store import Store, overlays, tables
-from app.store.values import Overlay, rfc3339
+from app.store import Store, overlays
+from app.store.values import Overlay
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 SQUARE = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1.5], [0, 0]]]}
@@ -43,9 +42,9 @@ def test_an_overlay_waits_and_expires(farm: Store):
     other, new = farm.add_overlay(blocked(reporter="r2", created=NOW + timedelta(seconds=2)))
     assert new
     assert farm.overlays("farm") == [again, edge, other]
-    assert farm.end_due_overlays(NOW + timedelta(seconds=59)) == []
+    farm.end_due_overlays(NOW + timedelta(seconds=59))
     assert len(farm.overlays("farm", "pending")) == 3
-    assert farm.end_due_overlays(NOW + timedelta(seconds=60)) == []
+    farm.end_due_overlays(NOW + timedelta(seconds=60))
     assert [o.state for o in farm.overlays("farm")] == ["pending", "expired", "expired"]
     assert farm.overlays("farm", "expired")[0].decided == NOW + timedelta(seconds=60)
     with pytest.raises(NotFound):
@@ -69,9 +68,9 @@ def test_acceptance_is_in_force_until_the_end_with_an_event_each(farm: Store):
     assert farm.standing("farm", 0) == (farm.version("farm", 0), 1), "a version's number is history"
     assert farm.standing("farm", 0, "apply")[0].closures == in_force
     end = NOW + timedelta(seconds=60)
-    assert farm.end_due_overlays(NOW) == []
+    farm.end_due_overlays(NOW)
     assert farm.overlay("farm", one.id).state == "accepted"
-    assert farm.end_due_overlays(end) == []
+    farm.end_due_overlays(end)
     assert (farm.overlay("farm", one.id).state, farm.closures("farm").items) == ("ended", ())
     assert farm.standing("farm", "latest")[1] == before + 2
     events = [(e.body["type"], e.body.get("overlays_digest")) for e in farm.events("farm", before)]
@@ -93,24 +92,19 @@ def test_editor_creates_accepted_overlay_with_one_event(farm: Store, monkeypatch
         farm.decide_overlay("farm", waits.id, "pending", "accepted", "ann", NOW)
 
 
-def test_marks_of_earlier_releases_are_lifted_for_as_long_as_they_may_stand_in_a_version(farm: Store):
-    """A release before closures put accepted overlays into versions, and a channel may stand on one for years."""
-    area, _ = farm.add_overlay(blocked())
-    edge, _ = farm.add_overlay(blocked(polygon=None, crs=None, edge="a_b"))
-    for one in (area, edge):
-        farm.decide_overlay("farm", one.id, "pending", "accepted", "ann", NOW)
-    table = tables.overlay
-    with farm._database.write() as connection:
-        connection.execute(update(table).values(version=1))
-    end = NOW + timedelta(seconds=60)
-    assert {o.id for o in farm.end_due_overlays(end)} == {area.id, edge.id}, "they are taken out of the newest version"
-    for one in (area, edge):
-        farm.decide_overlay("farm", one.id, "accepted", "ended", "ann", NOW - timedelta(days=400))
-    farm.collect(timedelta(hours=6))
-    found = farm.closures("farm")
-    assert found.items == ()
-    assert found.lifted_edges == {("a_b", rfc3339(end))}
-    assert found.lifted_zones == {f"overlay-{area.id}"}
+def test_kept_overlay_names_its_version_and_stays_in_force(farm: Store):
+    one, _ = farm.add_overlay(blocked(state="accepted"))
+    assert farm.note_kept_overlay("farm", one.id, 7) == replace(one, version=7)
+    assert [c.id for c in farm.closures("farm").items] == [one.id]
+    farm.end_due_overlays(NOW + timedelta(seconds=60))
+    assert farm.overlay("farm", one.id).state == "ended"
+
+
+def test_areas_in_force_are_bounded_in_size(farm: Store, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(overlays, "MAX_IN_FORCE_BYTES", 100)
+    farm.add_overlay(blocked(state="accepted"))
+    with pytest.raises(Conflict, match="simpler outlines"):
+        farm.add_overlay(blocked(state="accepted"))
 
 
 def test_overlays_are_bounded_and_tidied(farm: Store, monkeypatch: pytest.MonkeyPatch):
