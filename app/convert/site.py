@@ -312,13 +312,12 @@ def file_recipe(
     hints = dict(fmt.by_file(base))
     if name is None and parts.name in hints:
         name = _named_like(site, of_file, hints[parts.name])
+    kinds = {o: v for o, v in hints.items() if o != parts.name and _default_kinds(fmt).get(o) != v}
     maker = site.maker_of(name, of_file) if name is not None else None
     if maker is not None:
-        if base.rpartition(".")[2] not in {end.rpartition(".")[2] for end in fmt.files}:
-            kind = {option: value for option, value in hints.items() if option != parts.name}
-            site = replace(site, values={**kind, **site.values})
+        site = replace(site, values={**kinds, **site.values})
         return replace(_made_by(site, maker, None, None).recipe, file=file)
-    if site.main is not None and not hints.keys() - {parts.name}:  # as the manifest lists it, made once
+    if site.main is not None and not kinds:  # as the manifest lists it, made once
         return replace(_spread(site, site.main, None, None).recipe, file=file)
     if not folder and not _is_at_top(site, name):
         return None
@@ -327,6 +326,13 @@ def file_recipe(
         version, fmt.name, {**hints, **site.own_values, **selected}, derived=derived, without=without
     )
     return replace(found, file=base)
+
+
+def _default_kinds(fmt: Format) -> dict[str, str]:
+    """The options that the names of the format's usual files say, where all of them agree: a PGM is no special wish."""
+    said = [dict(fmt.by_file(name)) for name in fmt.files]
+    values = {option: {one[option] for one in said if option in one} for one in said for option in one}
+    return {option: next(iter(found)) for option, found in values.items() if len(found) == 1}
 
 
 def _named_like(site: _Site, level: str, stem: str) -> str:
