@@ -88,8 +88,8 @@ class Maps:
         def plan(without: frozenset[str]) -> Recipe:
             if known.parts is not None:
                 if file is not None:
-                    said = {known.parts.level, known.parts.name, *hints}  # by the file's name, whatever templates say
-                    asked = {**{n: v for n, v in filled.values.items() if n not in said}, **values}
+                    by_name = {known.parts.level, known.parts.name, *hints}  # the file's name overrides templates
+                    asked = {**{n: v for n, v in filled.values.items() if n not in by_name}, **values}
                     found = site.file_recipe(version, known, asked, file, derived=derive, without=without)
                     if found is not None:
                         return found

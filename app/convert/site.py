@@ -21,7 +21,7 @@ from app import derive
 from app.convert import recipe as recipes
 from app.convert.recipe import Chain, Member, Recipe, Spread, Stock
 from app.derive import Derivation
-from app.errors import NotFound
+from app.errors import MissingLayer, NotFound
 from app.formats import Format, Parts
 from app.model.frame import GROUND
 from app.model.layers import MAP, Layer, PartKey
@@ -85,6 +85,7 @@ class _Site:
     """What a site's map is put together from.
 
     stored: the parts of the format's layer; empty where they are derived. main: the chain that derives them then.
+    lacking: why there is neither.
     makers: the derivations of parts that are not stored. default: the level whose files are at the top. values: what
     was requested besides the parts; own_values: without what only the makers know.
     """
@@ -95,6 +96,7 @@ class _Site:
     available: Stock
     stored: tuple[PartKey, ...]
     main: Chain | None
+    lacking: MissingLayer | None
     makers: tuple[Derivation, ...]
     default: str
     values: Mapping[str, Any]
@@ -121,7 +123,7 @@ class _Site:
 
 
 def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: bool, without: frozenset[str]) -> _Site:
-    """Look at what is stored. values: without the options that select parts."""
+    """Find out what is stored and what can be derived. values: without the options that select parts."""
     assert fmt.parts is not None
     available = recipes.stock(version).seen_by(fmt)
     stored = tuple(sorted(key for key in available.keys if key.layer == fmt.parts.layer))
@@ -133,22 +135,27 @@ def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: 
     own = {f.name for f in dataclasses.fields(fmt.write_options)}
     only_makers = frozenset().union(*(derive.takes(d.name) for d in makers)) - own
     own_values = {name: value for name, value in values.items() if name not in only_makers}
-    main = None
+    main, lacking = None, None
     if not stored or own_values.keys() - own:  # not stored, or to be derived with these parameters
         options = recipes.own_options(fmt, own_values)
-        main = recipes.chain(fmt, available, options, derived=derived, values=own_values, without=without)
-        stored = () if main.steps else stored
-        main = main if main.steps else None
-    default = _default_level(version, stored, main)
-    return _Site(version, fmt, fmt.parts, available, stored, main, makers, default, values, own_values)
+        try:
+            main = recipes.chain(fmt, available, options, derived=derived, values=own_values, without=without)
+        except MissingLayer as error:
+            lacking = error
+        if main is not None and main.steps:
+            stored = ()
+        else:
+            main = None
+    needs = frozenset().union(*(maker.needs for maker in makers))
+    keys = stored or (main.keys if main is not None else [key for key in available.keys if key.layer in needs])
+    default = _default_level(version, keys)
+    return _Site(version, fmt, fmt.parts, available, stored, main, lacking, makers, default, values, own_values)
 
 
-def _default_level(version: Version, stored: Sequence[PartKey], main: Chain | None) -> str:
-    """``ground`` where the format's parts are there (too), else the lowest level that has one."""
-    levels = {key.level for key in stored}
-    if main is not None:
-        placed = {key.level for key in main.keys if key.layer not in SITE_WIDE}
-        levels = placed or {key.level for key in main.keys}
+def _default_level(version: Version, keys: Iterable[PartKey]) -> str:
+    """``ground`` where the parts that files are made of are there (too), else the lowest level that has one."""
+    placed = {key.level for key in keys if key.layer not in SITE_WIDE}
+    levels = placed or {key.level for key in keys}
     if not levels or GROUND in levels:
         return GROUND
     heights = {level.name: level.elevation for level in version.levels}
@@ -176,6 +183,8 @@ def recipe(
     site = _site(version, fmt, rest, derived=derived, without=without)
     levels = None if level == EVERY else frozenset({site.default if level is None else level})
     names = None if name in (EVERY, None) else frozenset({name})
+    if site.lacking is not None and not (names and any(names <= maker.makes for maker in site.makers)):
+        raise site.lacking
     members: list[Member] = []
     if site.main is None:
         members += _stored_members(site, levels, name, derived=derived)
@@ -232,8 +241,8 @@ def _spread(
     kept = tuple(sorted((k.level, k.name) for k in site.stored if k.name in makes))
     spread = Spread(site.default, makes, kept, optional=maker is not None)
     values = site.own_values if maker is None else site.values
-    known = {f.name for f in dataclasses.fields(site.format.write_options)}
-    options = recipes.own_options(site.format, {k: v for k, v in values.items() if k in known})
+    own = {f.name for f in dataclasses.fields(site.format.write_options)}
+    options = recipes.own_options(site.format, {option: value for option, value in values.items() if option in own})
     return Member(
         recipes.of_chain(site.version, site.format, options, way, spread), "", None, levels, names, only_default
     )
@@ -329,9 +338,9 @@ def file_recipe(
 
 
 def _default_kinds(fmt: Format) -> dict[str, str]:
-    """The options that the names of the format's usual files say, where all of them agree: a PGM is no special wish."""
-    said = [dict(fmt.by_file(name)) for name in fmt.files]
-    values = {option: {one[option] for one in said if option in one} for one in said for option in one}
+    """Collect the options that the names of the format's default files imply, where they agree: PGM is the default."""
+    hints = [dict(fmt.by_file(name)) for name in fmt.files]
+    values = {option: {one[option] for one in hints if option in one} for one in hints for option in one}
     return {option: next(iter(found)) for option, found in values.items() if len(found) == 1}
 
 

@@ -15,7 +15,7 @@ from app.convert import make, site
 from app.convert.cache import Cache, Product
 from app.convert.maps import file_of, joined
 from app.convert.recipe import Chain, Member, Recipe, Spread
-from app.errors import NotFound
+from app.errors import MissingLayer, NotFound
 from app.model.features import features
 from app.model.frame import Level
 from app.model.grid import OccupancyGrid
@@ -129,6 +129,15 @@ def test_layers_in_memory_give_the_whole_site(asked: dict[str, str], derived: bo
     assert {name.removesuffix(".pgm") for name in made.files if name.endswith(".pgm")} == expected
     drawn = [line for line in made.report["layers"] if line["information"] == "derived"]
     assert [(line["level"], line["name"]) for line in drawn] == [("L2", "keepout")] * ("L2/keepout" in expected)
+
+
+def test_masks_need_no_map() -> None:
+    known, layers = formats.get_format("occupancy_grid"), tower("keepout")
+    zones = Layers({k: p for k, p in layers.parts.items() if k.layer == "zones"}, None, layers.levels)
+    made = make.from_layers(known, zones, {"level": "*", "grid": "keepout"}, derived=True)
+    assert "keepout.pgm" in made.files, "the lowest level with zones is at the top"
+    with pytest.raises(MissingLayer):
+        make.from_layers(known, zones, {"level": "*", "grid": "*"}, derived=True)
 
 
 def test_whole_site_without_a_part_that_fits_is_not_found() -> None:
