@@ -39,6 +39,9 @@ MAX_CELLS = 2**28
 MAX_METRES_FROM_DATUM = 100_000.0
 """A closed area in degrees lies within this distance of the datum, in metres."""
 
+MAX_AREA_METRES = 10_000.0
+"""Maximum extent of a closed area, in metres."""
+
 MAX_LISTED = 100
 """Maximum number of edges that a report lists for one closure."""
 
@@ -120,6 +123,8 @@ def place_problem(closure: Closure, version: Version) -> str | None:
         box = shapely.total_bounds(_zones([closure]).in_local(_frame(version.datum)))
     except FleetMapError as error:
         return error.detail
+    if max(box[2] - box[0], box[3] - box[1]) > MAX_AREA_METRES:
+        return f"it is wider than {MAX_AREA_METRES / 1000:g} km"
     if closure.crs == "wgs84" and not (np.abs(box) <= MAX_METRES_FROM_DATUM).all():
         return f"it reaches more than {MAX_METRES_FROM_DATUM / 1000:g} km from the datum"
     return None

@@ -11,6 +11,7 @@ from app import bundle, formats
 from app.bundle import Hints, Known
 from app.convert import make as making
 from app.convert import recipe as recipes
+from app.convert import site
 from app.errors import Invalid, MissingLayer, Problem
 from app.formats import Files, Format, Limits
 from app.model.frame import Datum
@@ -62,6 +63,8 @@ def _offline(
     recipes.own_options(known, asked)
     needed: frozenset[Layer] = known.needs.also.union(*known.needs.one_of)
     wanted = None if "objects" in needed else needed  # whatever can be read can be an object
+    if site.asks_for_all(known, asked):
+        wanted = None  # further parts may be derived from any layer
     while True:
         knowing = Known(datum, None, wanted, not known.outlines, known.drawing or known.holds)
         told = bundle.read(bundle.unpack(load(), limits), hints, knowing, limits)

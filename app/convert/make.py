@@ -5,11 +5,12 @@ from __future__ import annotations
 import mimetypes
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from app import derive, formats
+from app import derive, formats, parameters
 from app.convert import closures as applied_closures
 from app.convert import recipe as recipes
 from app.convert import site
@@ -23,7 +24,7 @@ from app.model.frame import GROUND
 from app.model.layers import LAYERS, VECTOR_LAYERS, Layer, Layers, PartKey
 from app.model.templates import NO_TEMPLATES, Templates
 from app.store import Store
-from app.store.values import PartEntry, Version, datum_information
+from app.store.values import PartEntry, Provenance, Version, datum_information
 from app.templates import DEFAULT, resolve
 
 
@@ -228,6 +229,8 @@ def from_layers(
     closures: Closures | None = None,
 ) -> Written:
     """A map by the cheapest way that works on these layers. Raises what planning, deriving and writing raise."""
+    if site.asks_for_all(known, asked):
+        return _every_part(known, layers, asked, derived=derived, entries=entries, origin=origin, credit=credit)
     own = recipes.own_options(known, asked)
     without: frozenset[str] = frozenset()
     failed: list[Hindrance] = []
@@ -243,6 +246,66 @@ def from_layers(
         except CannotDerive as error:
             without |= {error.step}
             failed.append(Hindrance(error.step, error.detail, error.choose))
+
+
+def _every_part(
+    known: Format,
+    layers: Layers,
+    asked: Mapping[str, Any],
+    *,
+    derived: bool,
+    entries: Mapping[PartKey, PartEntry] | None,
+    origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None,
+    credit: Mapping[PartKey, Sequence[str]] | None,
+) -> Written:
+    """The map of several parts (``app.convert.site``), of layers that are in memory."""
+    version = _as_version(layers)
+    without: frozenset[str] = frozenset()
+    failed: list[Hindrance] = []
+    while True:
+        try:
+            recipe = site.recipe(version, known, asked, derived=derived, without=without, archive=False)
+        except MissingLayer as error:
+            raise recipes.exhausted(error, failed) from error
+        files: dict[str, bytes] = {}
+        places: dict[str, tuple[str, str]] = {}
+        reports: list[tuple[str, Mapping[str, Any]]] = []
+        try:
+            for member in recipe.members:
+                way, spread = member.recipe.chain, member.recipe.spread
+                kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
+                values = parameters.canonical(member.recipe.options)
+                one = write(known, kept, values, way, entries, origin, credit, spread=spread)
+                reports.append((member.folder, one.report))
+                for file in site.select([_Placed(name, one.places.get(name)) for name in one.files], member):
+                    files.setdefault(member.folder + file.name, one.files[file.name])
+                    places.setdefault(member.folder + file.name, file.place or member.place or ("", ""))
+        except CannotDerive as error:
+            without |= {error.step}
+            failed.append(Hindrance(error.step, error.detail, error.choose))
+            continue
+        if not files:
+            raise site.nothing_made(recipe)
+        return Written(files, site.merged_report(reports), places)
+
+
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """A file's name, and the level and name of the part that it is of, where it says so itself."""
+
+    name: str
+    place: tuple[str, str] | None
+
+
+def _as_version(layers: Layers) -> Version:
+    """What planning needs to know of layers that no store has."""
+    stock = recipes.stock_of(layers)
+    parts = []
+    for key in sorted(layers.parts):
+        bounds: Any = dict.fromkeys(stock.anchors.get(key, ()), (0.0, 0.0, 0.0, 0.0))
+        parts.append(PartEntry(key, "", int(key not in stock.blank), bounds, Provenance("raw")))
+    now = datetime.fromtimestamp(0, UTC)
+    return Version("", 0, "", None, "", "", now, {}, (), (), layers.datum, layers.levels, tuple(parts))
 
 
 def _inner(

@@ -85,24 +85,22 @@ class Maps:
         known = formats.get_format(name)
         values = values or {}
         filled = templates.resolve(version.templates, known)
+        hints = known.by_file(file.rpartition("/")[2]) if file is not None else {}
 
         def plan(without: frozenset[str]) -> Recipe:
             if known.parts is not None:
-                selectors = (known.parts.level, known.parts.name)
-                free = {n: v for n, v in filled.values.items() if n not in selectors}  # else they hide parts
                 if file is not None:
-                    asked = {**free, **values}
+                    by_name = {known.parts.level, known.parts.name, *hints}  # the file's name overrides templates
+                    asked = {**{n: v for n, v in filled.values.items() if n not in by_name}, **values}
                     found = site.file_recipe(version, known, asked, file, derived=derive, without=without)
                     if found is not None:
                         return found
                 elif listed or site.asks_for_all(known, values):
                     asked = {**filled.values, **values}
                     return site.recipe(version, known, asked, derived=derive, without=without, archive=not listed)
-            hints = known.by_file(file) if file is not None else {}
             asked = {**filled.values, **hints, **site.one_of(known, values)}
             return recipes.recipe(version, name, asked, derived=derive, without=without)
 
-        hints = known.by_file(file) if file is not None else {}
         origin = {**filled.origin, **dict.fromkeys({**hints, **values}, templates.REQUEST)}
         return self._planned(version, plan, origin)
 

@@ -22,7 +22,7 @@ from app.convert import closures as applied_closures
 from app.convert import recipe as recipes
 from app.convert.recipe import Chain, Member, Recipe, Spread, Stock
 from app.derive import Derivation
-from app.errors import NotFound
+from app.errors import MissingLayer, NotFound
 from app.formats import Format, Parts
 from app.model.frame import GROUND
 from app.model.layers import MAP, Layer, PartKey
@@ -86,6 +86,7 @@ class _Site:
     """What a site's map is put together from.
 
     stored: the parts of the format's layer; empty where they are derived. main: the chain that derives them then.
+    lacking: why there is neither.
     makers: the derivations of parts that are not stored. default: the level whose files are at the top. values: what
     was requested besides the parts; own_values: without what only the makers know.
     """
@@ -96,6 +97,7 @@ class _Site:
     available: Stock
     stored: tuple[PartKey, ...]
     main: Chain | None
+    lacking: MissingLayer | None
     makers: tuple[Derivation, ...]
     default: str
     values: Mapping[str, Any]
@@ -122,7 +124,7 @@ class _Site:
 
 
 def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: bool, without: frozenset[str]) -> _Site:
-    """Look at what is stored. values: without the options that select parts."""
+    """Find out what is stored and what can be derived. values: without the options that select parts."""
     assert fmt.parts is not None
     available = recipes.stock(version).seen_by(fmt)
     stored = tuple(sorted(key for key in available.keys if key.layer == fmt.parts.layer))
@@ -134,22 +136,27 @@ def _site(version: Version, fmt: Format, values: Mapping[str, Any], *, derived: 
     own = {f.name for f in dataclasses.fields(fmt.write_options)}
     only_makers = frozenset().union(*(derive.takes(d.name) for d in makers)) - own
     own_values = {name: value for name, value in values.items() if name not in only_makers}
-    main = None
+    main, lacking = None, None
     if not stored or own_values.keys() - own:  # not stored, or to be derived with these parameters
         options = recipes.own_options(fmt, own_values)
-        main = recipes.chain(fmt, available, options, derived=derived, values=own_values, without=without)
-        stored = () if main.steps else stored
-        main = main if main.steps else None
-    default = _default_level(version, stored, main)
-    return _Site(version, fmt, fmt.parts, available, stored, main, makers, default, values, own_values)
+        try:
+            main = recipes.chain(fmt, available, options, derived=derived, values=own_values, without=without)
+        except MissingLayer as error:
+            lacking = error
+        if main is not None and main.steps:
+            stored = ()
+        else:
+            main = None
+    needs = frozenset().union(*(maker.needs for maker in makers))
+    keys = stored or (main.keys if main is not None else [key for key in available.keys if key.layer in needs])
+    default = _default_level(version, keys)
+    return _Site(version, fmt, fmt.parts, available, stored, main, lacking, makers, default, values, own_values)
 
 
-def _default_level(version: Version, stored: Sequence[PartKey], main: Chain | None) -> str:
-    """``ground`` where the format's parts are there (too), else the lowest level that has one."""
-    levels = {key.level for key in stored}
-    if main is not None:
-        placed = {key.level for key in main.keys if key.layer not in SITE_WIDE}
-        levels = placed or {key.level for key in main.keys}
+def _default_level(version: Version, keys: Iterable[PartKey]) -> str:
+    """``ground`` where the parts that files are made of are there (too), else the lowest level that has one."""
+    placed = {key.level for key in keys if key.layer not in SITE_WIDE}
+    levels = placed or {key.level for key in keys}
     if not levels or GROUND in levels:
         return GROUND
     heights = {level.name: level.elevation for level in version.levels}
@@ -177,6 +184,8 @@ def recipe(
     site = _site(version, fmt, rest, derived=derived, without=without)
     levels = None if level == EVERY else frozenset({site.default if level is None else level})
     names = None if name in (EVERY, None) else frozenset({name})
+    if site.lacking is not None and not (names and any(names <= maker.makes for maker in site.makers)):
+        raise site.lacking
     members: list[Member] = []
     if site.main is None:
         members += _stored_members(site, levels, name, derived=derived)
@@ -233,8 +242,8 @@ def _spread(
     kept = tuple(sorted((k.level, k.name) for k in site.stored if k.name in makes))
     spread = Spread(site.default, makes, kept, optional=maker is not None)
     values = site.own_values if maker is None else site.values
-    known = {f.name for f in dataclasses.fields(site.format.write_options)}
-    options = recipes.own_options(site.format, {k: v for k, v in values.items() if k in known})
+    own = {f.name for f in dataclasses.fields(site.format.write_options)}
+    options = recipes.own_options(site.format, {option: value for option, value in values.items() if option in own})
     return Member(
         recipes.of_chain(site.version, site.format, options, way, spread), "", None, levels, names, only_default
     )
@@ -313,13 +322,12 @@ def file_recipe(
     hints = dict(fmt.by_file(base))
     if name is None and parts.name in hints:
         name = _named_like(site, of_file, hints[parts.name])
+    kinds = {o: v for o, v in hints.items() if o != parts.name and _default_kinds(fmt).get(o) != v}
     maker = site.maker_of(name, of_file) if name is not None else None
     if maker is not None:
-        if base.rpartition(".")[2] not in {end.rpartition(".")[2] for end in fmt.files}:
-            kind = {option: value for option, value in hints.items() if option != parts.name}
-            site = replace(site, values={**kind, **site.values})
+        site = replace(site, values={**kinds, **site.values})
         return replace(_made_by(site, maker, None, None).recipe, file=file)
-    if site.main is not None and not hints.keys() - {parts.name}:  # as the manifest lists it, made once
+    if site.main is not None and not kinds:  # as the manifest lists it, made once
         return replace(_spread(site, site.main, None, None).recipe, file=file)
     if not folder and not _is_at_top(site, name):
         return None
@@ -328,6 +336,13 @@ def file_recipe(
         version, fmt.name, {**hints, **site.own_values, **selected}, derived=derived, without=without
     )
     return replace(found, file=base)
+
+
+def _default_kinds(fmt: Format) -> dict[str, str]:
+    """Collect the options that the names of the format's default files imply, where they agree: PGM is the default."""
+    hints = [dict(fmt.by_file(name)) for name in fmt.files]
+    values = {option: {one[option] for one in hints if option in one} for one in hints for option in one}
+    return {option: next(iter(found)) for option, found in values.items() if len(found) == 1}
 
 
 def _named_like(site: _Site, level: str, stem: str) -> str:

@@ -34,6 +34,9 @@ SPEEDS = frozenset({"speed", "speed_limit", "speed_zone"})
 RESOLUTION = 0.05
 """Metres a cell where there is no map to take it from: what Nav2's maps usually have."""
 
+COARSEST = 1.0
+"""Maximum size of a cell in metres that is chosen for large zones without a map."""
+
 MARGIN = 1.0
 """Metres around the zones of a level without a map."""
 
@@ -193,9 +196,9 @@ def _frame(layers: Layers, level: str, shapes: list[Any], resolution: float | No
 
 
 def _coarse_enough(cell: float, low_high: Any) -> float:
-    """Double the size of a cell until a mask of this extent has a bearable number of cells."""
+    """Double the size of a cell, up to COARSEST, until a mask of this extent has a bearable number of cells."""
     width, height = float(low_high[2] - low_high[0]), float(low_high[3] - low_high[1])
-    while (width / cell) * (height / cell) > MOST_CELLS / 4:
+    while (width / cell) * (height / cell) > MOST_CELLS / 4 and cell * 2.0 <= COARSEST:
         cell *= 2.0
     return cell
 

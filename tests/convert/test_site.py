@@ -6,14 +6,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import shapely
 
 from app import formats
 from app.convert import make, site
 from app.convert.cache import Cache, Product
 from app.convert.maps import file_of, joined
 from app.convert.recipe import Chain, Member, Recipe, Spread
-from app.errors import NotFound
+from app.errors import MissingLayer, NotFound
+from app.model.features import features
+from app.model.frame import Level
+from app.model.grid import OccupancyGrid
+from app.model.layers import Layers, PartKey
 
 EMPTY = make.empty_report(formats.get_format("satellite"))
 
@@ -95,6 +101,52 @@ def test_file_of_a_map_of_several_parts_is_found_on_its_only_level(tmp_path: Pat
         file_of(spread, made, "c.tif")
     with pytest.raises(NotFound):
         file_of(replace(spread, spread=None), made, "a.tif")
+
+
+def tower(*kinds: str) -> Layers:
+    """A grid on two levels, and on L2 a zone of each of these kinds."""
+    cells = np.zeros((4, 6), np.uint8)
+    grid = OccupancyGrid(cells, 0.5, (0.0, 0.0, 0.0), "trinary", 0.65, 0.196, False, {})
+    parts: dict[PartKey, Any] = {PartKey("occupancy", level, "map"): grid for level in ("ground", "L2")}
+    rows = [(f"z{n}", shapely.box(n, 0, n + 1, 1), {"kind": kind}) for n, kind in enumerate(kinds)]
+    if rows:
+        parts[PartKey("zones", "L2", "zones")] = features(rows, "local")
+    return Layers(parts, None, (Level("ground"), Level("L2", 3.0)))
+
+
+@pytest.mark.parametrize(
+    ("asked", "derived", "expected"),
+    [
+        ({"level": "*", "grid": "*"}, True, {"map", "L2/map", "L2/keepout"}),
+        ({"level": "*", "grid": "*"}, False, {"map", "L2/map"}),
+        ({"level": "*"}, True, {"map", "L2/map"}),
+        ({"grid": "*"}, True, {"map"}),
+        ({"level": "*", "grid": "keepout"}, True, {"L2/keepout"}),
+    ],
+)
+def test_layers_in_memory_give_the_whole_site(asked: dict[str, str], derived: bool, expected: set[str]) -> None:
+    made = make.from_layers(formats.get_format("occupancy_grid"), tower("keepout", "priority"), asked, derived=derived)
+    assert {name.removesuffix(".pgm") for name in made.files if name.endswith(".pgm")} == expected
+    drawn = [line for line in made.report["layers"] if line["information"] == "derived"]
+    assert [(line["level"], line["name"]) for line in drawn] == [("L2", "keepout")] * ("L2/keepout" in expected)
+
+
+def test_masks_need_no_map() -> None:
+    known, layers = formats.get_format("occupancy_grid"), tower("keepout")
+    zones = Layers({k: p for k, p in layers.parts.items() if k.layer == "zones"}, None, layers.levels)
+    made = make.from_layers(known, zones, {"level": "*", "grid": "keepout"}, derived=True)
+    assert "keepout.pgm" in made.files, "the lowest level with zones is at the top"
+    with pytest.raises(MissingLayer):
+        make.from_layers(known, zones, {"level": "*", "grid": "*"}, derived=True)
+
+
+def test_whole_site_without_a_part_that_fits_is_not_found() -> None:
+    known = formats.get_format("occupancy_grid")
+    for asked in ({"level": "*", "grid": "keepout"}, {"level": "L9", "grid": "*"}):
+        with pytest.raises(NotFound):
+            make.from_layers(known, tower(), asked, derived=True)
+    with pytest.raises(NotFound, match="none of them can be derived"):
+        make.from_layers(known, tower("speed"), {"level": "*", "grid": "keepout"}, derived=True)
 
 
 def test_formats_with_parts_declare_their_own_options() -> None:
