@@ -61,7 +61,7 @@ def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
     random.seed(1)
     acknowledged: dict[int, str] = {}
     root = Path(__file__).resolve().parents[2]
-    for _ in range(4):
+    for left in range(3, -1, -1):
         child = subprocess.Popen(
             [sys.executable, "-c", CHILD, store.database_url, str(store.blob_dir)],
             stdout=subprocess.PIPE,
@@ -71,9 +71,11 @@ def test_kill_9_leaves_the_old_state_or_the_new_one(store: Store):
         )
         assert child.stdout is not None
         assert child.stdout.readline() == "ready\n"
+        # On a busy machine none may have committed before it was killed: then the last one is left to commit once.
+        lines = [child.stdout.readline()] if not left and not acknowledged else []
         time.sleep(random.uniform(0.05, 0.6))
         child.send_signal(signal.SIGKILL)
-        for line in child.stdout:
+        for line in (*lines, *child.stdout):
             if line.startswith("committed") and line.endswith("\n"):
                 _, number, known = line.split()
                 acknowledged[int(number)] = known
