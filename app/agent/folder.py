@@ -31,6 +31,7 @@ KEPT = 2
 
 READ_ONLY = 0o444
 CHUNK = 1 << 20
+HASH_BYTES = 1 << 18
 
 
 class Folder:
@@ -261,8 +262,11 @@ class Folder:
 
 def digest(path: Path) -> str:
     """SHA-256 of a file."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    total, buffer = hashlib.sha256(), memoryview(bytearray(HASH_BYTES))
+    with path.open("rb", buffering=0) as stream:
+        while count := stream.readinto(buffer):
+            total.update(buffer[:count])
+    return total.hexdigest()
 
 
 def _holds(path: Path, file: File) -> bool:

@@ -7,7 +7,7 @@ import json
 import os
 import signal
 import sys
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -103,7 +103,7 @@ def agent(
 
     def print_line(what: str, members: dict[str, Any]) -> None:
         if as_json:
-            time = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+            time = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
             sys.stdout.write(json.dumps({"time": time, "event": what, **members}, ensure_ascii=False) + "\n")
             sys.stdout.flush()
         else:
