@@ -173,7 +173,9 @@ def test_what_is_no_time_is_refused(text: str) -> None:
 def test_hooks_are_part_of_the_package() -> None:
     target = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
     assert target["packages"] == ["app"]
-    assert {p.name for p in (ROOT / "app" / "agent" / "hooks").glob("*.sh")} == {"nav2.sh", "topological.sh"}
+    assert {p.name for p in (ROOT / "app" / "agent" / "hooks").iterdir() if p.is_file()} == {
+        "__init__.py", "nav2.sh", "ros2.py", "topological.sh",
+    }  # fmt: skip
 
 
 def test_the_unit_keeps_the_maps_where_the_robot_can_read_them() -> None:
