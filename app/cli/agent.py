@@ -17,6 +17,15 @@ import typer
 from app.cli import options, output
 
 
+def _copy_ros_package(workspace: Path | None) -> None:
+    """Copy the ROS 2 package and end."""
+    if workspace is not None:
+        from app.agent import ros
+
+        output.say(f"wrote {ros.copy_package(workspace)}: build it with colcon build --packages-select fleetmap_ros")
+        raise typer.Exit
+
+
 def agent(
     environment: Annotated[str, typer.Option("--environment", "-e", help="Name of the environment.")],
     formats: Annotated[str, typer.Option("--formats", "-f", help="Formats to keep, separated by commas.")],
@@ -75,6 +84,16 @@ def agent(
     ca: Annotated[
         Path | None,
         typer.Option("--ca", envvar="FLEETMAP_CA", help="Who signs the server's certificate, PEM [default: public]."),
+    ] = None,
+    ros_package: Annotated[  # noqa: ARG001  its callback
+        Path | None,
+        typer.Option(
+            "--ros-package",
+            metavar="DIR",
+            callback=_copy_ros_package,
+            is_eager=True,
+            help="Copy the ROS 2 package fleetmap_ros into this folder (a workspace's src), and end.",
+        ),
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="Bring the folder up to date once, and end.")] = False,
     server: options.Server = None,

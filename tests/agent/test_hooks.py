@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from app.agent import hooks
-from app.agent.hooks import ros2
+from app.agent.ros.fleetmap_ros import loading
 from tests.agent.conftest import Start, network
 from tests.api import samples
 from tests.api.conftest import Api
@@ -304,7 +304,7 @@ def test_topological(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) 
     assert ros.read_text() == "", "the network did not change"
     changed = variables(current, "tmap2/network.tmap2.yaml")
     file = current / "tmap2" / "network.tmap2.yaml"
-    wanted = ros2.read_network(file)
+    wanted = loading.read_network(file)
     assert (wanted.nodes, wanted.edges) == ({"A", "B"}, {"A_B"})
     right = {**tmap2("A", "B"), "name": wanted.name, "pointset": wanted.pointset}
     published(ros, {}, tmap2("old"), right)
@@ -323,7 +323,7 @@ def test_topological(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_success_of_the_map_manager_proves_nothing(ros: Path, current: Path) -> None:
     changed = variables(current, "tmap2/network.tmap2.yaml")
-    wanted = ros2.read_network(current / "tmap2" / "network.tmap2.yaml")
+    wanted = loading.read_network(current / "tmap2" / "network.tmap2.yaml")
     right = {**tmap2("A", "B"), "name": wanted.name, "pointset": wanted.pointset}
     for last, reason in (
         ({}, "its name is '', not"),
@@ -362,8 +362,8 @@ def test_networks_are_read_as_the_server_writes_them(tmp_path: Path) -> None:
     made = offline({"n.tmap2.yaml": yaml.safe_dump(body).encode()}, "tmap2", hints=Hints("tmap2"))
     (data,) = made.files.values()
     (tmp_path / "n.yaml").write_bytes(data)
-    network = ros2.read_network(tmp_path / "n.yaml")
-    assert network == ros2.network_of(json.dumps(yaml.safe_load(data)))
+    network = loading.read_network(tmp_path / "n.yaml")
+    assert network == loading.network_of(json.dumps(yaml.safe_load(data)))
     assert (len(network.nodes), len(network.edges)) == (len(names), len(names) - 1)
 
 

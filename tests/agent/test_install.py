@@ -174,7 +174,7 @@ def test_hooks_are_part_of_the_package() -> None:
     target = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
     assert target["packages"] == ["app"]
     assert {p.name for p in (ROOT / "app" / "agent" / "hooks").iterdir() if p.is_file()} == {
-        "__init__.py", "nav2.sh", "ros2.py", "topological.sh",
+        "__init__.py", "nav2.sh", "topological.sh",
     }  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """Load a robot's new map into Nav2 and topological_navigation.
 
-The hooks ``nav2`` and ``topological`` run this file with the machine's own ``python3`` (standard library only, no
-installed package); the ROS 2 node ``fleetmap_ros`` imports it. What is to be called is decided here, once; how it is
+The agent's hooks ``nav2`` and ``topological`` run this file with the machine's own ``python3`` (standard library only,
+no installed package); the ROS 2 node ``fleetmap_ros`` imports it. What is to be called is decided here, once; how it is
 called is a ``Ros``: the command ``ros2``, or rclpy.
 
 Each step is one printed line, and one JSON line ``{"step", "result", "detail"}`` in the file that FLEETMAP_HOOK_STATUS
@@ -247,28 +247,12 @@ class Nav2:
     def _level(self) -> str | None:
         return f"level {self._site.level}" if self._site.prefix else None
 
-    def _grids(self) -> list[str]:
-        """Names of the level's grids."""
-        folder = self._site.folder / self._site.path("occupancy_grid", "")
-        return sorted(p.stem for p in folder.glob("*.yaml") if not p.stem.endswith("_filter_info"))
-
-    def _map_name(self, grids: Sequence[str]) -> str | None:
-        """Name of the grid for the map server; None if there is none. Raises LoadError if several fit."""
-        if self._names.grid:
-            return self._names.grid
-        if "map" in grids:
-            return "map"
-        maps = [g for g in grids if g not in ("nogo", self._names.keepout_grid, self._names.speed_grid)]
-        if len(maps) > 1:
-            raise LoadError(f"there are the grids {', '.join(maps)}: name one with FLEETMAP_NAV2_GRID")
-        return maps[0] if maps else None
-
     def _map(self) -> str | None:
         server = self._names.map_server
         if not server:
             return None
-        grids = self._grids()
-        name = self._map_name(grids)
+        grids = grid_names(self._site)
+        name = map_grid(grids, self._names)
         path = self._site.path("occupancy_grid", f"{name or 'map'}.yaml")
         if name in grids:
             if not self._is_due("map", path):
@@ -398,6 +382,24 @@ class Nav2:
             "occupied_thresh: 0.65\nfree_thresh: 0.25\n"
         )
         return path.resolve()
+
+
+def grid_names(site: Site) -> list[str]:
+    """Names of the level's grids."""
+    folder = site.folder / site.path("occupancy_grid", "")
+    return sorted(p.stem for p in folder.glob("*.yaml") if not p.stem.endswith("_filter_info"))
+
+
+def map_grid(grids: Sequence[str], names: Names) -> str | None:
+    """Name of the grid for the map server; None if there is none. Raises LoadError if several fit."""
+    if names.grid:
+        return names.grid
+    if "map" in grids:
+        return "map"
+    maps = [g for g in grids if g not in ("nogo", names.keepout_grid, names.speed_grid)]
+    if len(maps) > 1:
+        raise LoadError(f"there are the grids {', '.join(maps)}: name one with FLEETMAP_NAV2_GRID")
+    return maps[0] if maps else None
 
 
 def blocked_edges(path: Path) -> set[int]:
@@ -688,18 +690,22 @@ def _message(line: str) -> str | None:
 # --- the hooks ---
 
 
-def reporter(status_file: str | None) -> Report:
-    """Print each step, and append it to the file that FLEETMAP_HOOK_STATUS names."""
+def _print(line: str) -> None:
+    print(line, flush=True)
+
+
+def reporter(status_file: str | None, write: Callable[[str], object] = _print) -> Report:
+    """Print each step, or hand it to ``write``, and append it to the file that FLEETMAP_HOOK_STATUS names."""
 
     def report(step: str, result: str, detail: str) -> None:
-        print(f"{step}: {result}: {detail}", flush=True)
+        write(f"{step}: {result}: {detail}")
         if status_file:
             line = json.dumps({"step": step, "result": result, "detail": detail})
             try:
                 with Path(status_file).open("a") as stream:
                     stream.write(line + "\n")
             except OSError as error:
-                print(f"{status_file} cannot be written: {error.strerror}", flush=True)
+                write(f"{status_file} cannot be written: {error.strerror}")
 
     return report
 
