@@ -10,7 +10,7 @@ import threading
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import yaml
@@ -19,8 +19,10 @@ from app.agent import hooks
 from app.agent.ros.fleetmap_ros import loading
 from tests.agent.conftest import Start, network
 from tests.api import samples
-from tests.api.conftest import Api
 from tests.events.conftest import eventually
+
+if TYPE_CHECKING:
+    from tests.api.conftest import Api
 
 ROS2 = r"""#!/bin/sh
 case "$1 $2" in
@@ -340,6 +342,7 @@ def test_success_of_the_map_manager_proves_nothing(ros: Path, current: Path) -> 
 
 
 def test_networks_are_read_as_the_server_writes_them(tmp_path: Path) -> None:
+    pytest.importorskip("numpy", reason="the server's packages")
     from app.bundle import Hints
     from app.convert import offline
 

@@ -8,8 +8,6 @@ import pytest
 
 from app.agent.ros.fleetmap_ros import grids
 
-pytest.importorskip("yaml", reason="PyYAML comes with ROS 2, not with a robot's install")
-
 HEAD = "resolution: 0.05\norigin: [-1.5, 2.0, 0.25]\nnegate: {negate}\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
 
 
@@ -74,7 +72,7 @@ def test_a_yaml_that_is_none(tmp_path: Path, text: str) -> None:
 
 def test_as_the_server_writes_it(tmp_path: Path) -> None:
     """A grid that the server has read and written, against the server's own cells."""
-    np = pytest.importorskip("numpy")
+    np = pytest.importorskip("numpy", reason="the server's packages")
     from app.bundle import Hints
     from app.convert import offline
     from tests.api import samples

@@ -10,6 +10,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
+import yaml
 
 from app.agent import ros
 from app.errors import Conflict
@@ -76,7 +77,6 @@ def test_files_agree_on_names_and_version() -> None:
 
 
 def test_the_sample_parameters_are_parameters() -> None:
-    yaml = pytest.importorskip("yaml")
     from app.agent.ros.fleetmap_ros.control import Settings
 
     body = yaml.safe_load((ros.HERE / "config" / "fleetmap_agent.yaml").read_text())
