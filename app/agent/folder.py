@@ -13,7 +13,6 @@ Files that did not change are hard links to those of the version before, so they
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import os
 import shlex
 import shutil
@@ -22,7 +21,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
-from app.agent.state import sync_folder, write_new
+from app.agent.state import digest, sync_folder, write_new
 from app.agent.trust import File, Manifest, parse
 from app.errors import Conflict, Invalid, Unavailable, Untrusted
 
@@ -31,7 +30,6 @@ KEPT = 2
 
 READ_ONLY = 0o444
 CHUNK = 1 << 20
-HASH_BYTES = 1 << 18
 
 
 class Folder:
@@ -258,15 +256,6 @@ class Folder:
             ("manifest.json", manifest.data),
         ):
             write_new(where / name, data)
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file."""
-    total, buffer = hashlib.sha256(), memoryview(bytearray(HASH_BYTES))
-    with path.open("rb", buffering=0) as stream:
-        while count := stream.readinto(buffer):
-            total.update(buffer[:count])
-    return total.hexdigest()
 
 
 def _holds(path: Path, file: File) -> bool:

@@ -18,7 +18,7 @@ from urllib.parse import quote, urljoin
 
 import httpx
 
-from app.agent.folder import digest
+from app.agent.state import digest
 from app.agent.trust import File
 from app.errors import Denied, FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.events.login import trusting
