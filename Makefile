@@ -12,6 +12,10 @@ ARGS ?=
 UV := $(shell uv --version >/dev/null 2>&1 && echo uv || echo $(BIN)/uv)
 SYNC := UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen --extra server --inexact --quiet --no-python-downloads
 
+# What a robot runs, and signing for its tests: on Python 3.10 as well (Ubuntu 22.04, ROS 2 Humble). `compression` is Python 3.14's; others take the backport.
+ROBOT := app/__init__.py app/errors.py app/event_types.py app/events/__init__.py app/events/login.py \
+  app/events/messages.py app/model/__init__.py app/model/frame.py app/model/names.py app/signing.py app/agent app/cli
+
 .PHONY: run test lint bench chaos install install-dev clean
 
 run: install
@@ -24,6 +28,8 @@ lint: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy --python-version 3.10 --follow-imports silent $(ROBOT)
+	$(BIN)/vermin --target=3.10- --violations --no-tips --exclude compression --exclude compression.zstd $(ROBOT)
 	$(BIN)/lint-imports
 	UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) lock --check --no-python-downloads
 

@@ -13,7 +13,7 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -404,7 +404,7 @@ class Agent:
             channel=channel,
             formats=self.options.formats,
             mark=mark,
-            now=datetime.fromtimestamp(self._clock(), UTC),
+            now=datetime.fromtimestamp(self._clock(), timezone.utc),
         )
         return manifest, key
 
@@ -582,7 +582,7 @@ class Agent:
             version, root = self._target
         channel = self._state.channel or self.options.channel or LATEST
         sequence = manifest.sequence if manifest else None
-        moment = datetime.fromtimestamp(self._clock(), UTC)
+        moment = datetime.fromtimestamp(self._clock(), timezone.utc)
         now = moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
         detail = detail[: messages.MAX_DETAIL] if detail else None
         status = RobotStatus(channel, version, root, state, detail, now, sequence, holds=self._loaded(manifest))

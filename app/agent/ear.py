@@ -194,7 +194,7 @@ def configuration(connect: str, file: Path | None = None, login: Login | None = 
 
     Raises Invalid where a file of the login is missing.
     """
-    config = zenoh.Config.from_file(str(file)) if file is not None else zenoh.Config()
+    config: zenoh.Config = zenoh.Config.from_file(str(file)) if file is not None else zenoh.Config()
     values: Mapping[str, Any] = {
         "mode": "client",
         "connect/endpoints": [part.strip() for part in connect.split(",") if part.strip()],

@@ -13,7 +13,6 @@ Files that did not change are hard links to those of the version before, so they
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import os
 import shlex
 import shutil
@@ -22,7 +21,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
-from app.agent.state import sync_folder, write_new
+from app.agent.state import digest, sync_folder, write_new
 from app.agent.trust import File, Manifest, parse
 from app.errors import Conflict, Invalid, Unavailable, Untrusted
 
@@ -257,12 +256,6 @@ class Folder:
             ("manifest.json", manifest.data),
         ):
             write_new(where / name, data)
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def _holds(path: Path, file: File) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -16,6 +17,7 @@ from pathlib import Path
 from app.errors import Invalid
 
 FORM = 1
+HASH_BYTES = 1 << 18
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,3 +115,12 @@ def sync_folder(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    total, buffer = hashlib.sha256(), memoryview(bytearray(HASH_BYTES))
+    with path.open("rb", buffering=0) as stream:
+        while count := stream.readinto(buffer):
+            total.update(buffer[:count])
+    return total.hexdigest()

@@ -14,7 +14,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from typing import Any
 
 from cryptography.exceptions import InvalidSignature
@@ -32,6 +32,10 @@ _HASH = re.compile(r"[0-9a-f]{64}")
 _FORMAT = re.compile(r"[a-z0-9][a-z0-9_]{0,62}")
 _LAYER = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _KEY_ID = re.compile(r"[0-9a-f]{16}")
+_TIME = re.compile(
+    r"(?P<date>\d{4}-\d\d-\d\d)[Tt ](?P<clock>\d\d:\d\d:\d\d)(\.(?P<fraction>\d{1,30}))?(?P<zone>[Zz]|[+-]\d\d:\d\d)",
+    re.ASCII,
+)
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
 _FORBIDDEN = re.compile(
     r"PATH|ENV|IFS|HOME|SHELL|(LD|DYLD|BASH|GIT|SSH|FLEETMAP)_\w*|PYTHON\w*|\w*_PRELOAD|\w*LIBRARY_PATH"
@@ -85,7 +89,7 @@ def parse(data: bytes, signature: str) -> Manifest:
     try:
         body = json.loads(data)
         files = tuple(File(f["format"], f["name"], f["size"], f["sha256"]) for f in body["files"])
-        expires = datetime.fromisoformat(body["expires"])
+        expires = read_time(body["expires"])
         found = Manifest(
             body["environment"],
             body.get("channel"),
@@ -111,6 +115,19 @@ def parse(data: bytes, signature: str) -> Manifest:
     if not all(isinstance(t, str) for t in found.layers.values()) or not all(map(_LAYER.fullmatch, found.layers)):
         raise Untrusted("the server's manifest cannot be read: a layer's name or hash is none")
     return found
+
+
+def read_time(text: str) -> datetime:
+    """Read an RFC 3339 time. Raises ValueError.
+
+    Python 3.10's own ``fromisoformat`` reads neither ``Z`` nor a fraction of other than 3 or 6 digits.
+    """
+    found = _TIME.fullmatch(text)
+    if found is None:
+        raise ValueError(f"not an RFC 3339 time: {text[:80]!r}")
+    fraction = f".{(found['fraction'] + '000000')[:6]}" if found["fraction"] else ""
+    zone = "+00:00" if found["zone"] in ("Z", "z") else found["zone"]
+    return datetime.fromisoformat(f"{found['date']}T{found['clock']}{fraction}{zone}")
 
 
 def _check_variables(variables: Mapping[str, str]) -> None:
@@ -226,7 +243,7 @@ def check(
         raise Untrusted(f"the manifest is of the environment {manifest.environment!r}, not of {environment!r}")
     if manifest.channel != channel:
         raise Untrusted(f"the manifest is of the channel {manifest.channel!r}, not of {channel!r}")
-    if manifest.expires < (now or datetime.now(UTC)) - CLOCKS_DIFFER:
+    if manifest.expires < (now or datetime.now(timezone.utc)) - CLOCKS_DIFFER:
         raise Untrusted(
             f"the manifest has expired at {manifest.expires:%Y-%m-%d %H:%M:%S} UTC: somebody hands out an old one, or "
             "a clock is wrong"

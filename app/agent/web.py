@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import hashlib
 import json
 import os
 import socket
@@ -19,6 +18,7 @@ from urllib.parse import quote, urljoin
 
 import httpx
 
+from app.agent.state import digest
 from app.agent.trust import File
 from app.errors import Denied, FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.events.login import trusting
@@ -385,8 +385,7 @@ def _complete(part: Path, file: File) -> bool:
     try:
         if part.stat().st_size != file.size:
             return False
-        with part.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest() == file.sha256
+        return digest(part) == file.sha256
     except FileNotFoundError:
         return False
 
@@ -398,8 +397,8 @@ def _fits(old: int, new: int) -> bool:
 
 def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: File) -> Iterator[bytes]:
     """The new file of a ``dcz`` body, in pieces; never much more than the manifest's size."""
-    where, digest = old
-    want = DCZ_MAGIC + bytes.fromhex(digest)
+    where, sha256 = old
+    want = DCZ_MAGIC + bytes.fromhex(sha256)
     head = b""
     for chunk in chunks:
         head += chunk

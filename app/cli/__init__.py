@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from typing import Annotated, Any
 
 import typer
@@ -36,7 +37,7 @@ HINTS: Mapping[str, str] = {
 def run(arguments: Sequence[str]) -> int:
     """One command: its exit status. Errors are printed to standard error, as JSON with ``--json``."""
     as_json = "--json" in arguments
-    completing = "_FLEETMAP_COMPLETE" in os.environ
+    completing = "_FLEETMAP_COMPLETE" in os.environ and find_spec("pydantic_settings") is not None
     try:
         command = build(all_flags=completing or list(arguments[:1]) == ["serve"])
         command(list(arguments), prog_name="fleetmap", standalone_mode=True)

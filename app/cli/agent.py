@@ -7,7 +7,7 @@ import json
 import os
 import signal
 import sys
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -15,6 +15,15 @@ from typing import Annotated, Any
 import typer
 
 from app.cli import options, output
+
+
+def _copy_ros_package(workspace: Path | None) -> None:
+    """Copy the ROS 2 package and end."""
+    if workspace is not None:
+        from app.agent import ros
+
+        output.say(f"wrote {ros.copy_package(workspace)}: build it with colcon build --packages-select fleetmap_ros")
+        raise typer.Exit
 
 
 def agent(
@@ -76,6 +85,16 @@ def agent(
         Path | None,
         typer.Option("--ca", envvar="FLEETMAP_CA", help="Who signs the server's certificate, PEM [default: public]."),
     ] = None,
+    ros_package: Annotated[  # noqa: ARG001  its callback
+        Path | None,
+        typer.Option(
+            "--ros-package",
+            metavar="DIR",
+            callback=_copy_ros_package,
+            is_eager=True,
+            help="Copy the ROS 2 package fleetmap_ros into this folder (a workspace's src), and end.",
+        ),
+    ] = None,
     once: Annotated[bool, typer.Option("--once", help="Bring the folder up to date once, and end.")] = False,
     server: options.Server = None,
     token: options.Token = None,
@@ -103,7 +122,7 @@ def agent(
 
     def print_line(what: str, members: dict[str, Any]) -> None:
         if as_json:
-            time = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+            time = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
             sys.stdout.write(json.dumps({"time": time, "event": what, **members}, ensure_ascii=False) + "\n")
             sys.stdout.flush()
         else:

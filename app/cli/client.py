@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from email.message import Message
 from pathlib import Path, PurePosixPath
 from types import TracebackType
-from typing import IO, Any, Self
+from typing import IO, Any
 from urllib.parse import quote, urljoin
 
 import httpx
@@ -124,7 +124,7 @@ class Client:
             verify=trusting(Path(ca)) if ca else True,
         )
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Client:
         return self
 
     def __exit__(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli import options, output, write
+from app.cli import local, options, output, write
 from app.cli.client import Client, Refused, path_of
 from app.cli.folder import check_name, environment_name
 from app.cli.history import show_made
@@ -68,6 +68,7 @@ def generate(
 
 
 def _list(*, as_json: bool) -> None:
+    local.require_server_python("generate")
     from app.generate import all_generators
 
     known = [one.as_dict() for one in all_generators().values()]
@@ -105,6 +106,7 @@ def _ensure(client: Client, name: str, datum: Datum | None) -> None:
 def _write(
     site: str, seed: int, values: dict[str, str], datum: Datum | None, to: str, out: str, *, as_json: bool
 ) -> None:
+    local.require_server_python("generate --to")
     from app import formats, generate, parameters
     from app.convert import written
     from app.derive import Notes

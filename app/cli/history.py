@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli import options, output
+from app.cli import local, options, output
 from app.cli.client import Client, Refused, path_of
 
 Environment = Annotated[str, typer.Argument(help="Name of the environment.")]
@@ -256,9 +256,6 @@ def _environments(limit: int, server: str | None, token: str | None, *, as_json:
 
 def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
     """What the named server can compute, or where none is named, or none answers, what any can."""
-    from app.api.derivations import as_dict
-    from app.derive import all_derivations
-
     named = server or os.environ.get("FLEETMAP_SERVER")
     why = "no server is named"
     if named:
@@ -270,6 +267,10 @@ def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
             if refused.status is not None:
                 raise
             why = str(refused)
+    local.require_server_python("derive")
+    from app.api.derivations import as_dict
+    from app.derive import all_derivations
+
     output.say(f"{why}: a server with a provider of pictures has location_to_imagery, too")
     return [as_dict(d) for d in all_derivations().values()]
 

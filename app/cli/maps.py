@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from app.cli import folder as folders
-from app.cli import options, output, write
+from app.cli import local, options, output, write
 from app.cli.client import Client, Download, LocalFile, Refused, path_of
 from app.cli.history import change_line, channel_rows
 from app.errors import Invalid, NotFound
@@ -163,6 +163,7 @@ def convert(
     A map of several files becomes a folder, or a ZIP where the output's name ends in .zip. Options are the wanted
     format's, or a derivation's on the way; those that neither knows go to the readers.
     """
+    local.require_server_python("convert")
     from app import formats, parameters
     from app.bundle import Hints
     from app.convert import offline
@@ -202,6 +203,7 @@ def check(
     The rules are those of each format's own loaders (Nav2's map_server, its route server, …); nothing is uploaded or
     changed. The exit status is 1 where a map would be refused.
     """
+    local.require_server_python("check")
     from app import bundle, formats
 
     collected, _, notes = _collect(paths)
@@ -232,6 +234,7 @@ def list_formats(as_json: options.Json = False) -> None:
 
     Needs no server.
     """
+    local.require_server_python("formats")
     from app import formats
     from app.api.formats import as_dict
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli import options, output
+from app.cli import local, options, output
 from app.cli.client import Client, Refused
 from app.errors import FleetMapError, Unavailable
 
@@ -101,6 +101,7 @@ def migrate(
 
     PostgreSQL needs it before the server of a new release starts; SQLite is brought up at each start anyway.
     """
+    local.require_server_python("migrate")
     settings = load_settings({"database_url": database_url, "data_dir": data_dir})
     with output.progress_bar("migrating"), _store(settings) as store:
         store.migrate()
@@ -139,6 +140,7 @@ def application() -> Any:
 
 def load_settings(values: Mapping[str, Any]) -> Settings:
     """The settings: flags first, then the environment, ``.env``, mounted secrets. BadParameter for unusable ones."""
+    local.require_server_python("serve")
     from pydantic import ValidationError
 
     from app.config import Settings
@@ -163,6 +165,7 @@ def load_settings(values: Mapping[str, Any]) -> Settings:
 
 def with_flags(function: Callable[..., None]) -> Callable[..., None]:
     """``serve`` with an option for every setting, as ``app.config.Settings`` declares them."""
+    local.require_server_python("serve")
     from app.config import Settings
 
     def command(**values: Any) -> None:

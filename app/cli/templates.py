@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli import options, output
+from app.cli import local, options, output
 from app.cli.client import Client, path_of
 from app.cli.history import change_line
 
@@ -89,6 +89,7 @@ def _show_made(environment: str, made: Mapping[str, Any], *, before: int) -> Non
 
 
 def _sets(*, as_json: bool) -> None:
+    local.require_server_python("template")
     from app import templates
 
     known = [one.as_dict(name) for name, one in templates.SETS.items()]

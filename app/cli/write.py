@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from app.errors import Invalid
+from app.model.names import bad_name
 
 STDOUT = Path("-")
 
@@ -68,8 +69,6 @@ def unpack(archive: Path, folder: Path) -> list[str]:
 
 def inside(folder: Path, name: str) -> Path:
     """The place of a named file below a folder; Invalid for names that would leave it."""
-    from app.formats._archive import bad_name
-
     reason = bad_name(name)
     if reason:
         raise Invalid(f"the map has a file called {name!r}, which cannot be written here: its name {reason}")

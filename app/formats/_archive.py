@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 from app.errors import Problem, TooLarge, UnreadableFile, UnsafeArchive
 from app.formats import Limits
+from app.model.names import bad_name
 
 _END = struct.Struct("<4s4H2LH")
 _END64 = struct.Struct("<4sQ2H2L4Q")
@@ -35,10 +36,6 @@ _MASK16, _MASK32 = 0xFFFF, 0xFFFFFFFF
 _ZIP64, _UNICODE_PATH = 0x0001, 0x7075
 
 _CHUNK = 2**20
-MAX_NAME = 1024
-MAX_DEPTH = 64
-"""Longest path in an archive, in characters and in folders."""
-
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
@@ -113,26 +110,6 @@ def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:
             info.compress_type = zipfile.ZIP_DEFLATED if shrinks else zipfile.ZIP_STORED
             archive.writestr(info, body, compresslevel=6)
     return out.getvalue()
-
-
-def bad_name(name: str) -> str | None:
-    """Why a relative path must not be used, or None: said as ``it …``."""
-    if not name or len(name) > MAX_NAME:
-        return f"has not 1 to {MAX_NAME} characters"
-    if "\\" in name:
-        return "has a backslash"
-    if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
-        return "has control characters"
-    if name.startswith("/") or (len(name) > 1 and name[1] == ":"):
-        return "is absolute"
-    parts = name.removesuffix("/").split("/")
-    if len(parts) > MAX_DEPTH:
-        return f"is nested in more than {MAX_DEPTH} folders"
-    if ".." in parts:
-        return "leaves the archive with .."
-    if "." in parts or "" in parts:
-        return "has an empty or . folder"
-    return None
 
 
 def _unsafe(reason: str, where: str | None = None) -> UnsafeArchive:

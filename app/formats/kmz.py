@@ -12,6 +12,7 @@ from app.formats import _archive as archive
 from app.formats._kml import FAMILY, read_kml
 from app.formats._kml_writing import NEEDS, write_kml
 from app.model.layers import Layers, Part, PartKey, Resources
+from app.model.names import bad_name
 
 MAIN = "map.kmz"
 DOCUMENT = "doc.kml"
@@ -62,7 +63,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
                 if others.setdefault(name, body) != body:
                     context.drop("resources", 1, f"two levels bring another file called {name}")
     made = write_kml(layers, context, with_pictures=True, taken=frozenset(others))
-    main = made.entry if made.entry and not archive.bad_name(made.entry) else DOCUMENT
+    main = made.entry if made.entry and not bad_name(made.entry) else DOCUMENT
     stem, n = main.removesuffix(".kml"), 2
     while main in others or main in made.pictures:
         main, n = f"{stem}-{n}.kml", n + 1

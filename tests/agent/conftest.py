@@ -20,8 +20,10 @@ import httpx
 import pytest
 
 from tests.api import samples
-from tests.api.conftest import ADMIN, Api, running, settings_for
 from tests.events.conftest import eventually, free_port
+
+if sys.version_info >= (3, 11):  # the server's
+    from tests.api.conftest import ADMIN, Api, running, settings_for
 
 ROOT = Path(__file__).parents[2]
 
@@ -40,6 +42,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def api(folder: Path, port: int) -> Iterator[Api]:
     """A server with a router of its own, for all tests of a module."""
+    if sys.version_info < (3, 11):
+        pytest.skip("the server needs Python 3.11")
     with running(settings_for(folder, zenoh_mode="router", zenoh_listen=f"tcp/127.0.0.1:{port}")) as api:
         eventually(lambda: api.get("/readyz").json()["events"]["state"] == "connected")
         yield api
@@ -61,7 +65,10 @@ def network(moved: float = 0.0, count: int = 600) -> bytes:
 
 
 class Robot:
-    """``fleetmap agent --json`` in a process of its own; ``lines`` is what it printed."""
+    """``fleetmap agent --json`` in a process of its own; ``lines`` is what it printed.
+
+    FLEETMAP_TEST_PYTHON: another interpreter for it.
+    """
 
     def __init__(self, server: str, env: str, into: Path, *more: str, formats: str = "tmap2", **variables: str) -> None:
         clean = {k: v for k, v in os.environ.items() if not k.startswith("FLEETMAP_")}
@@ -70,7 +77,7 @@ class Robot:
             arguments += ["--robot", into.name]
         self.into = into
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "app.cli", *arguments, *more],
+            [os.environ.get("FLEETMAP_TEST_PYTHON", sys.executable), "-m", "app.cli", *arguments, *more],
             env={**clean, "FLEETMAP_TOKEN": ADMIN, "PYTHONPATH": str(ROOT), **variables},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

@@ -8,7 +8,7 @@ import hashlib
 import json
 import threading
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,7 @@ class Fake:
             "sequence": sequence,
             "version": number,
             "root": hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest(),
-            "expires": (datetime.now(UTC) + timedelta(days=1)).isoformat(),
+            "expires": (datetime.now(timezone.utc) + timedelta(days=1)).isoformat(),
             "files": [
                 {
                     "format": path.partition("/")[0],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -157,7 +157,7 @@ def test_an_old_manifest_is_refused(api: Api, held: str, robot: Start, gate: Gat
     ("members", "word"),
     [
         ({"expires": "2020-01-01T00:00:00Z"}, "expired"),
-        ({"expires": (datetime.now(UTC) - timedelta(seconds=200)).isoformat()}, "expired"),
+        ({"expires": (datetime.now(timezone.utc) - timedelta(seconds=200)).isoformat()}, "expired"),
         ({"environment": "elsewhere"}, "of the environment 'elsewhere'"),
         ({"channel": "staging"}, "of the channel 'staging'"),
         ({"channel": None}, "of the channel None"),
@@ -192,7 +192,7 @@ def test_after_an_attack_all_is_well(held: str, robot: Start, gate: Gate, keys: 
 
 
 def test_a_minute_between_clocks_is_no_attack(held: str, robot: Start, gate: Gate, keys: Keys) -> None:
-    gate.change = signed(keys, expires=(datetime.now(UTC) - timedelta(seconds=20)).isoformat())
+    gate.change = signed(keys, expires=(datetime.now(timezone.utc) - timedelta(seconds=20)).isoformat())
     assert robot(server=gate.url).good
 
 

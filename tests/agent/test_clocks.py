@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -46,13 +46,13 @@ def test_activation_comes_at_the_servers_time(
     one = agent(fast)
     assert one.once()
     api.upload(place, {"n.tmap2.yaml": network(1)})
-    at = datetime.now(UTC) + timedelta(seconds=4)
+    at = datetime.now(timezone.utc) + timedelta(seconds=4)
     api("PUT", channel, 200, json={"version": 2, "activate_at": at.isoformat()})
     assert one.once()
     assert gate.statuses[-1]["state"] == "ready"
     assert whole(tmp_path / "robot")["version"] == 1, "not by the robot's clock"
     eventually(lambda: _stands(api, channel) == 2)
-    assert datetime.now(UTC) >= at
+    assert datetime.now(timezone.utc) >= at
     assert one.once()
     assert whole(tmp_path / "robot")["version"] == 2
     told = api.get(f"robots/robot?environment={place}").json()
@@ -72,7 +72,7 @@ def test_expiry_allows_for_a_minute(
     place: str, agent: Make, gate: Gate, api: Api, folder: Path, tmp_path: Path, fast: float, good: bool
 ) -> None:
     api.get("keys")
-    soon = (datetime.now(UTC) + timedelta(seconds=20)).isoformat()
+    soon = (datetime.now(timezone.utc) + timedelta(seconds=20)).isoformat()
     gate.change = signed(Keys(folder / "keys"), expires=soon)
     assert agent(fast).once() is good
     assert (tmp_path / "robot" / "current").exists() is good

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ast
+import fnmatch
 import re
 import subprocess
 import sys
 import tomllib
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
+from app.agent import trust
 from tests.agent.conftest import ROOT, Start
 from tests.agent.conftest import whole as whole_map
 from tests.api.conftest import ADMIN, Api
@@ -45,7 +49,6 @@ def without_server(*arguments: str) -> subprocess.CompletedProcess[str]:
     """``fleetmap`` where none of the server's packages can be imported."""
     server = names(PROJECT["optional-dependencies"]["server"])
     absent = {MODULES.get(name, name.replace("-", "_")) for name in server} | {"starlette"}
-    absent -= {"pydantic"}  # newer releases of typer bring it along
     script = BLOCKED.format(absent=absent)
     return subprocess.run(
         [sys.executable, "-c", script, *arguments],
@@ -86,10 +89,93 @@ def test_other_commands_say_what_to_install(arguments: list[str], tmp_path: Path
     assert 'pip install "fleet-map-server[server]"' in told.stderr, told.stderr
 
 
+def robot_modules() -> list[str]:
+    """ROBOT of the Makefile: what `make lint` checks for Python 3.10."""
+    text = (ROOT / "Makefile").read_text().replace("\\\n", " ")
+    found = re.search(r"^ROBOT := (.+)$", text, re.MULTILINE)
+    assert found is not None
+    return found[1].split()
+
+
+def imported(path: Path) -> set[str]:
+    """Modules of ours that are imported with this file: not those within a function or below TYPE_CHECKING."""
+    found: set[str] = set()
+    todo: list[ast.AST] = [ast.parse(path.read_text())]
+    while todo:
+        node = todo.pop()
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{one.name}" for one in node.names)}
+        elif isinstance(node, ast.Import):
+            found |= {one.name for one in node.names}
+        lazy = isinstance(node, ast.FunctionDef) or (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node))
+        todo += [] if lazy and "app/agent" not in path.as_posix() else list(ast.iter_child_nodes(node))
+    return {name for name in found if name.partition(".")[0] == "app"}
+
+
+def file_of(module: str) -> Path | None:
+    base = ROOT.joinpath(*module.split("."))
+    return next((p for p in (base / "__init__.py", base.with_suffix(".py")) if p.is_file()), None)
+
+
+def test_all_that_a_robot_imports_is_checked_for_python_3_10() -> None:
+    checked = {p for name in robot_modules() for p in ([ROOT / name] if name.endswith(".py") else [])}
+    checked |= {p for name in robot_modules() for p in (ROOT / name).rglob("*.py")}
+    for path in sorted(checked):
+        for module in imported(path):
+            parents = [module.rsplit(".", n)[0] for n in range(module.count(".") + 1)]
+            for file in filter(None, map(file_of, parents)):
+                assert file in checked, f"{path} imports {file}, which is not in ROBOT of the Makefile"
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["ruff"]["per-file-target-version"]
+    assert set(patterns.values()) == {"py310"}
+    for path in checked:
+        name = path.relative_to(ROOT).as_posix()
+        fits = (p for pattern in patterns for p in braces(pattern) if fnmatch.fnmatch(name, p.replace("**", "*")))
+        assert next(fits, None), f"{name} is not among [tool.ruff.per-file-target-version]"
+
+
+def braces(pattern: str) -> list[str]:
+    head, brace, rest = pattern.partition("{")
+    inner, _, tail = rest.partition("}")
+    return [head + one + tail for one in inner.split(",")] if brace else [pattern]
+
+
+def test_the_server_code_is_imported_after_a_check_of_the_python() -> None:
+    robot = {file_of(f"app.cli.{p.stem}") for p in (ROOT / "app" / "cli").glob("*.py")}
+    robot |= {ROOT / name for name in robot_modules()}
+    count = 0
+    for path in sorted((ROOT / "app" / "cli").glob("*.py")):
+        for function in (n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.FunctionDef)):
+            body = ast.unparse(function)
+            lazy = {m for m in re.findall(r"from (app[\w.]*) import", body) if m != "app.cli"}
+            lazy |= {f"app.{m}" for names in re.findall(r"from app import (.+)", body) for m in names.split(", ")}
+            files = {file_of(m) for m in lazy if not m.startswith("app.agent")}
+            if files - robot and function.name not in AFTER_THE_CHECK:
+                assert "require_server_python(" in body, f"{path.name}: {function.name} imports {files - robot}"
+                count += 1
+    assert count >= 8
+
+
+AFTER_THE_CHECK = {"_compile", "_store", "_main", "bundle"}
+"""Called by a function that has checked."""
+
+
+@pytest.mark.parametrize("text", ["2026-11-22T10:00:00Z", "2026-11-22T10:00:00.1234567+00:00", "2026-11-22t10:00:00z"])
+def test_times_are_read_on_any_python(text: str) -> None:
+    assert trust.read_time(text).replace(microsecond=0) == datetime(2026, 11, 22, 10, tzinfo=UTC)
+
+
+@pytest.mark.parametrize("text", ["", "2026-11-22", "2026-11-22T10:00:00", "2026-13-22T10:00:00Z", "20261122T100000Z"])
+def test_what_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(ValueError):
+        trust.read_time(text)
+
+
 def test_hooks_are_part_of_the_package() -> None:
     target = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
     assert target["packages"] == ["app"]
-    assert {p.name for p in (ROOT / "app" / "agent" / "hooks").glob("*.sh")} == {"nav2.sh", "topological.sh"}
+    assert {p.name for p in (ROOT / "app" / "agent" / "hooks").iterdir() if p.is_file()} == {
+        "__init__.py", "nav2.sh", "topological.sh",
+    }  # fmt: skip
 
 
 def test_the_unit_keeps_the_maps_where_the_robot_can_read_them() -> None:

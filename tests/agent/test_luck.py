@@ -9,6 +9,7 @@ import gzip
 import hashlib
 import json
 import os
+import pathlib
 import shutil
 import subprocess
 import sys
@@ -439,6 +440,9 @@ def nth(monkeypatch: pytest.MonkeyPatch, number: int, error: BaseException) -> l
             return real(*arguments, **more)
 
         monkeypatch.setattr(os, name, call)
+        accessor = getattr(pathlib, "_normal_accessor", None)  # Python 3.10's pathlib has its own names for them
+        if hasattr(accessor, name):
+            monkeypatch.setattr(accessor, name, call)
 
     for name in ("fsync", "replace", "rename", "link", "symlink", "mkdir", "utime"):
         failing(name)

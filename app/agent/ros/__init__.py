@@ -1,0 +1,39 @@
+"""The ROS 2 package ``fleetmap_ros``, and how it gets into a workspace.
+
+The package is complete in this folder (``package.xml``, ``setup.py`` …). It imports nothing of this distribution: it
+starts ``fleetmap agent`` as a process, so that the agent may be installed elsewhere (pipx) than rclpy is.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from app.errors import Conflict
+
+HERE = Path(__file__).resolve().parent
+FILES = ("package.xml", "setup.py", "setup.cfg", "resource", "launch", "config", "fleetmap_ros")
+
+
+def copy_package(workspace: Path) -> Path:
+    """Copy the package to ``workspace/fleetmap_ros``, in place of an older copy of it: its folder.
+
+    Raises Conflict if something else is there.
+    """
+    target = workspace / "fleetmap_ros"
+    if target.exists():
+        if (
+            not (target / "package.xml").is_file()
+            or "<name>fleetmap_ros</name>" not in (target / "package.xml").read_text()
+        ):
+            raise Conflict(f"{target} exists and is no copy of fleetmap_ros: name another folder")
+        shutil.rmtree(target)
+    target.mkdir(parents=True)
+    ignored = shutil.ignore_patterns("__pycache__", "*.pyc")
+    for name in FILES:
+        source = HERE / name
+        if source.is_dir():
+            shutil.copytree(source, target / name, ignore=ignored)
+        else:
+            shutil.copyfile(source, target / name)
+    return target

@@ -1,0 +1,127 @@
+"""The robot's install and the agent's tests on Python 3.10: ROS 2 Humble's."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.agent.conftest import ROOT, Robot, Start, network, whole
+from tests.api.conftest import Api
+from tests.events.conftest import eventually
+
+SERVER = re.compile(
+    r"^(from|import) (tests\.(api\.conftest|cli|bench|certificates)|app\.(api|store|events\.(bus|router)))",
+    re.MULTILINE,
+)
+"""Imports of a test module that needs the server's packages."""
+
+
+def find_python() -> Path | None:
+    """A Python 3.10 of this machine."""
+    named = os.environ.get("FLEETMAP_PYTHON310") or shutil.which("python3.10")
+    places = [Path(named)] if named else []
+    places += sorted(Path.home().glob(".pyenv/versions/3.10.*/bin/python3.10"))
+    for path in places:
+        ended = subprocess.run(
+            [path, "-c", "import sys, venv; print(*sys.version_info[:2])"], capture_output=True, text=True, check=False
+        )
+        if ended.stdout.split() == ["3", "10"]:
+            return path
+    return None
+
+
+@pytest.fixture(scope="module")
+def python310(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of an environment with the robot's install, built from the lock file."""
+    python = find_python()
+    if python is None:
+        pytest.skip("no Python 3.10 was found: name one with FLEETMAP_PYTHON310")
+    uv = shutil.which("uv") or str(Path(sys.executable).with_name("uv"))
+    place = tmp_path_factory.mktemp("python310") / "venv"
+    command = [uv, "sync", "--frozen", "--no-editable", "--no-default-groups", "--group", "robot", "--quiet"]
+    ended = subprocess.run(
+        [*command, "--no-python-downloads", "--python", python],
+        cwd=ROOT,
+        env={**os.environ, "UV_PROJECT_ENVIRONMENT": str(place), "UV_SYSTEM_CERTS": "true"},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+    return place / "bin" / "python"
+
+
+def fleetmap(python: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """The installed command, away from the checkout."""
+    command = [python.with_name("fleetmap"), *arguments]
+    return subprocess.run(command, cwd=python.parent, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_the_install_has_all_a_robot_needs(python310: Path, tmp_path: Path) -> None:
+    assert fleetmap(python310, "--version").stdout.startswith("fleetmap ")
+    assert "--on-change" in fleetmap(python310, "agent", "--help").stdout
+    ended = fleetmap(python310, "agent", "--ros-package", str(tmp_path))
+    assert ended.returncode == 0, ended.stderr
+    assert (tmp_path / "fleetmap_ros" / "resource" / "fleetmap_ros").is_file(), "it is part of the wheel"
+    script = "from app.agent import hooks; print(*hooks.ready_made()); import app.agent.core, sys; print(*sys.modules)"
+    listed = subprocess.run([python310, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=True)
+    ready, loaded = listed.stdout.splitlines()
+    assert ready.split() == ["nav2", "topological"]
+    assert not {"pydantic", "numpy", "fastapi", "sqlalchemy"} & {m.partition(".")[0] for m in loaded.split()}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["serve"], ["serve", "--help"], ["migrate"], ["formats"], ["generate"], ["template"], ["derive"],
+        ["check", "."], ["convert", ".", "--to", "kml", "-o", "-"], ["generate", "cave", "--to", "kml", "-o", "-"],
+    ],
+)  # fmt: skip
+def test_commands_of_the_server_name_the_python_they_need(python310: Path, arguments: list[str]) -> None:
+    ended = fleetmap(python310, *arguments)
+    assert ended.returncode == 1
+    assert f"fleetmap {arguments[0]}" in ended.stderr
+    assert "needs Python 3.11 or newer, and this is 3.10." in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_an_agent_on_3_10_follows_a_server(
+    python310: Path, api: Api, place: str, robot: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Events over Zenoh, a delta, the signature, the status: a real agent process of the installed packages."""
+    monkeypatch.setenv("FLEETMAP_TEST_PYTHON", str(python310))
+    one: Robot = robot(name="humble")
+    one.wait("active", seconds=60, version=1)
+    one.wait("connected", seconds=60)
+    api.upload(place, {"n.tmap2.yaml": network(1.0)})
+    one.wait("active", seconds=60, version=2)
+    assert whole(one.into)["version"] == 2
+    eventually(lambda: [r for r in api.get("robots").json() if r["robot"] == "humble" and r["version"] == 2])
+    assert one.stop() == 0
+
+
+OWN = sorted(p for p in Path(__file__).parent.rglob("test_*.py") if not SERVER.search(p.read_text()))
+
+
+def test_the_agents_own_tests_are_found() -> None:
+    assert {"test_hooks.py", "test_luck.py", "test_grids.py", "test_node.py"} <= {p.name for p in OWN}
+
+
+@pytest.mark.parametrize("file", OWN, ids=lambda path: path.stem)
+def test_the_agents_own_tests_pass_on_3_10(python310: Path, file: Path, tmp_path: Path) -> None:
+    """Tests of this folder that need no server, one file a test."""
+    clean = {k: v for k, v in os.environ.items() if not k.startswith(("PYTEST_", "FLEETMAP_"))}
+    ended = subprocess.run(
+        [python310, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", ROOT / "pyproject.toml", "--rootdir", ROOT,
+         "--confcutdir", ROOT / "tests" / "agent", "--basetemp", tmp_path / "tests", file],
+        cwd=ROOT, env=clean, capture_output=True, text=True, timeout=280, check=False,
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stdout[-8000:] + ended.stderr[-2000:]
+    assert re.search(r"\d+ passed", ended.stdout), ended.stdout[-500:]
