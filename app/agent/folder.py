@@ -42,6 +42,8 @@ class Folder:
         self.versions = self.path / "versions"
         self.partial = self.path / "partial"
         self.state = self.path / "state.json"
+        self.protected: frozenset[str] = frozenset()
+        """Names of versions that are never removed: they may be switched to again."""
         self._lock: IO[str] | None = None
 
     def open(self) -> None:
@@ -231,7 +233,9 @@ class Folder:
     def _drop(self, kept: int, needed: Iterable[Path] = ()) -> None:
         """Remove versions beside the current one but so many, the last used ones, and those of needed files."""
         spared = {self.standing} | {p.relative_to(self.versions).parts[0] for p in needed if self.versions in p.parents}
-        for name in [n for n in self._names() if n not in spared][kept:]:
+        old = [name for name in self._names() if name not in spared]
+        removable = [name for name in old if name not in self.protected]
+        for name in removable[max(0, kept - len(old) + len(removable)) :]:
             gone = self.versions / f".{name}"
             shutil.rmtree(gone, ignore_errors=True)
             (self.versions / name).rename(gone)

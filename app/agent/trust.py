@@ -20,6 +20,7 @@ from typing import Any
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
+from app.agent.state import Mark
 from app.errors import Untrusted
 
 CLOCKS_DIFFER = timedelta(seconds=60)
@@ -73,6 +74,17 @@ class Manifest:
     signature: str
     variables: Mapping[str, str] = field(default_factory=dict)
     layers: Mapping[str, str] = field(default_factory=dict)
+    epoch: int = 0
+
+    @property
+    def mark(self) -> Mark:
+        """Its position in the channel's history."""
+        return Mark(self.epoch, self.sequence, self.root)
+
+    @property
+    def map_key(self) -> tuple[Any, ...]:
+        """Equal for manifests whose version folders are the same."""
+        return self.root, self.content
 
     @property
     def content(self) -> dict[str, str]:
@@ -98,10 +110,14 @@ def parse(data: bytes, signature: str) -> Manifest:
             signature,
             dict(body.get("variables", {})),
             dict(body.get("layers", {})),
+            body.get("epoch", 0),
         )
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise Untrusted(f"the server's manifest cannot be read: {type(error).__name__}: {error}") from None
-    whole = all(type(n) is int and 0 <= n < 2**63 for n in (found.sequence, found.version, *(f.size for f in files)))
+    whole = all(
+        type(n) is int and 0 <= n < 2**63
+        for n in (found.sequence, found.version, found.epoch, *(f.size for f in files))
+    )
     texts = all(isinstance(t, str) for t in (found.environment, found.channel or "", found.root))
     hashes = texts and all(isinstance(h, str) and _HASH.fullmatch(h) for h in (found.root, *(f.sha256 for f in files)))
     if not (whole and hashes) or expires.tzinfo is None or len(files) > MAX_FILES:
@@ -215,10 +231,10 @@ def check(
     environment: str,
     channel: str | None,
     formats: Sequence[str],
-    mark: tuple[int, str] | None,
+    mark: Mark | None,
     now: datetime | None = None,
 ) -> None:
-    """Whether a signed manifest is the one that was asked for. mark: sequence and root of the newest one ever believed.
+    """Whether a signed manifest is the one that was asked for. mark: that of the newest one ever believed.
 
     Raises Untrusted, with what an operator can do.
     """
@@ -237,14 +253,15 @@ def check(
         raise Untrusted(f"the manifest is of other formats: without {missing or 'none'}, with {more or 'no'} further")
     if mark is None:
         return
-    if manifest.sequence < mark[0]:
+    if (manifest.epoch, manifest.sequence) < (mark.epoch, mark.sequence):
+        epoch = f" of epoch {manifest.epoch}" if manifest.epoch != mark.epoch else ""
         raise Untrusted(
-            f"the manifest has the sequence {manifest.sequence}, and {mark[0]} was seen already: somebody hands out an "
-            "old map. If the server was set up anew, remove state.json"
+            f"manifest sequence {manifest.sequence}{epoch} is lower than {mark.sequence}, which this robot has already "
+            "accepted: possible rollback. If the server was set up anew, remove state.json"
         )
-    if manifest.sequence == mark[0] and manifest.root != mark[1]:
+    if (manifest.epoch, manifest.sequence) == (mark.epoch, mark.sequence) and manifest.root != mark.root:
         raise Untrusted(
-            f"the manifest of sequence {manifest.sequence} has the root {manifest.root[:8]}, and {mark[1][:8]} was "
+            f"the manifest of sequence {manifest.sequence} has the root {manifest.root[:8]}, and {mark.root[:8]} was "
             "seen under the same number: there are two servers with one key. If it was restored, remove state.json"
         )
 

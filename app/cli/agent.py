@@ -31,6 +31,14 @@ def agent(
         list[str] | None,
         typer.Option("--on-change", help="Command to run after a change, or `nav2`, `topological`; repeatable."),
     ] = None,
+    before_switch: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--before-switch",
+            help="Command to run when a new map is ready: exit status 0 switches, 75 asks again in some seconds, any "
+            "other refuses the map; repeatable.",
+        ),
+    ] = None,
     key: Annotated[
         str | None,
         typer.Option(
@@ -119,6 +127,7 @@ def agent(
             channel=channel,
             robot=robot_name(robot),
             on_change=tuple(on_change or ()),
+            before_switch=tuple(before_switch or ()),
             token=token or None,
             key=key or None,
             poll_seconds=poll,

@@ -7,7 +7,7 @@ import contextlib
 import hashlib
 import json
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -140,6 +140,21 @@ def send(handler: BaseHTTPRequestHandler, status: int, body: bytes, **headers: s
         handler.send_header(name, value)
     handler.end_headers()
     handler.wfile.write(body)
+
+
+@contextlib.contextmanager
+def run(one: One) -> Iterator[None]:
+    """It runs until the end of the block."""
+    one.agent.open()
+    thread = threading.Thread(target=one.agent.run, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        one.agent.stop()
+        thread.join(30)
+        assert not thread.is_alive(), "it does not end"
+        one.agent.close()
 
 
 class One:
