@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from app.agent import hooks
 from app.agent.folder import Folder
+from app.agent.levels import level_problem, level_variables, read_level
 from app.agent.options import Options
 from app.agent.state import StateStore, write_whole
 from app.agent.trust import Manifest
@@ -111,21 +112,21 @@ class Activation:
         self.retries = retries
         self.pending: Pending | None = None
 
-    def switch(self, name: str, manifest: Manifest, members: Mapping[str, Any], now: str) -> Outcome:
+    def switch(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
         """Switch to a built version if ``--before-switch`` agrees. The hooks run with ``load``.
 
         Args:
             members: of the log line ``switched``.
-            now: RFC 3339, for the status.
+            since: RFC 3339 time from which the version lies ready.
         """
-        if self._options.before_switch:
-            since = self.pending.since if self.pending and self.pending.name == name else now
-            self.pending = Pending(name, manifest, since, members)
-            self.protect()
-            if (outcome := self._before_switch(name, manifest, since)) is not None:
-                return outcome
-        self.pending = None
-        self._folder.switch(name)
+        with self._folder.hooks_lock(self._stopping):
+            if self._options.before_switch:
+                self.pending = Pending(name, manifest, since, members)
+                self.protect()
+                if (outcome := self._before_switch(name, manifest, since)) is not None:
+                    return outcome
+            self.pending = None
+            self._folder.switch(name)
         self.protect()
         self._log("switched", **members)
         return ACTIVE
@@ -148,8 +149,9 @@ class Activation:
     def _before_switch(self, name: str, manifest: Manifest, since: str) -> Outcome | None:
         """Run the commands: None if all agree to the switch."""
         installed = self._folder.manifest(self._store.value.activated)
-        variables = self.variables(manifest, changed_files(installed, manifest), changed_layers(installed, manifest))
-        variables["FLEETMAP_NEXT"] = str(self._folder.versions / name)
+        variables = self._variables(manifest, installed)
+        ready = self._folder.versions / name
+        variables |= {"FLEETMAP_NEXT": str(ready), "FLEETMAP_CLOSURES_FILE": str(ready / "closures.json")}
         for command in self._options.before_switch:
             ended = hooks.execute(command, variables, BEFORE_SWITCH_LIMIT_SECONDS, self._stopping)
             if ended.status == 0:
@@ -181,9 +183,10 @@ class Activation:
             return ACTIVE
         if (reason := self.retries.reason(name)) is not None:
             return Outcome("failed", reason)
-        if (problem := self._run_hooks(name, manifest)) is None:
-            return ACTIVE
-        return self._go_back(name, manifest, problem)
+        with self._folder.hooks_lock(self._stopping):
+            if (problem := self._run_hooks(name, manifest)) is None:
+                return ACTIVE
+            return self._go_back(name, manifest, problem)
 
     def _go_back(self, name: str, manifest: Manifest, problem: str) -> Outcome:
         """Put the version whose hooks succeeded last in place of one whose hooks failed."""
@@ -206,10 +209,13 @@ class Activation:
 
     def _run_hooks(self, name: str, manifest: Manifest) -> str | None:
         """Run the ``--on-change`` commands: None if all succeeded, and the version counts as loaded."""
+        level = read_level(self._folder)
+        if (problem := level_problem(manifest, level)) is not None:
+            return problem
         before = self._folder.manifest(self._store.value.activated)
         if self._options.on_change:  # cut off in the middle, or taken back: what the robot has loaded is unknown
             self._store.set(activated=None)
-        variables = self.variables(manifest, changed_files(before, manifest), changed_layers(before, manifest))
+        variables = self._variables(manifest, before)
         for command in self._options.on_change:
             problem = hooks.run(command, variables, stopping=self._stopping)
             if problem is not None:
@@ -221,24 +227,40 @@ class Activation:
         self.protect()
         return None
 
-    def variables(self, manifest: Manifest, files: Sequence[str], layers: Sequence[str]) -> dict[str, str]:
-        """Return the environment variables of a command."""
-        return {
-            "FLEETMAP_ENVIRONMENT": manifest.environment,
-            "FLEETMAP_VERSION": str(manifest.version),
-            "FLEETMAP_ROOT": manifest.root,
-            "FLEETMAP_CHANNEL": manifest.channel or "",
-            "FLEETMAP_SEQUENCE": str(manifest.sequence),
-            "FLEETMAP_CURRENT": str(self._folder.current),
-            **_file_variables(self._folder.path / "changed", files),
-            "FLEETMAP_LAYERS": " ".join(layers),
-            "FLEETMAP_ROBOT": self._robot,
-        }
+    def _variables(self, manifest: Manifest, before: Manifest | None) -> dict[str, str]:
+        """Return the environment variables of a command. before: what the robot has loaded."""
+        files, layers = changed_files(before, manifest), changed_layers(before, manifest)
+        return hook_variables(self._folder, manifest, files, layers, read_level(self._folder), self._robot)
+
+
+def hook_variables(
+    folder: Folder, manifest: Manifest, files: Sequence[str], layers: Sequence[str], level: str | None, robot: str
+) -> dict[str, str]:
+    """Return the environment variables of a command.
+
+    Args:
+        files, layers: changed ones.
+        level: the one that the robot is on.
+    """
+    return {
+        "FLEETMAP_ENVIRONMENT": manifest.environment,
+        "FLEETMAP_VERSION": str(manifest.version),
+        "FLEETMAP_ROOT": manifest.root,
+        "FLEETMAP_CHANNEL": manifest.channel or "",
+        "FLEETMAP_SEQUENCE": str(manifest.sequence),
+        "FLEETMAP_CURRENT": str(folder.current),
+        **_file_variables(folder.path / "changed", files),
+        "FLEETMAP_LAYERS": " ".join(layers),
+        "FLEETMAP_ROBOT": robot,
+        "FLEETMAP_OVERLAYS": manifest.overlays_digest or "",
+        "FLEETMAP_CLOSURES_FILE": str(folder.current / "closures.json"),
+        **level_variables(manifest, level),
+    }
 
 
 def identity(manifest: Manifest) -> str:
     """Return the subject under which a failure of this manifest is noted: a newer sequence is another one."""
-    return f"{manifest.sequence} {manifest.root}"
+    return f"{manifest.epoch} {manifest.sequence} {manifest.root} {manifest.closures_key}"
 
 
 def _file_variables(path: Path, names: Sequence[str]) -> dict[str, str]:

@@ -19,11 +19,13 @@ from app.agent.activation import ACTIVE, BEFORE_SWITCH_SECONDS, Activation, LogE
 from app.agent.download import Downloads
 from app.agent.ear import Ear
 from app.agent.folder import Folder
+from app.agent.levels import write_hooks
 from app.agent.options import Options, robot_name
+from app.agent.requests import encode_entries, parse_requests
 from app.agent.state import Mark, State, StateStore
 from app.agent.status import StatusReporter
 from app.agent.trust import Manifest
-from app.agent.web import Busy, Stopped, Web
+from app.agent.web import Busy, ClosuresChanged, Stopped, Web
 from app.errors import FleetMapError, Invalid, NotFound, Untrusted
 from app.events import messages
 from app.events.messages import RobotState, RobotStatus
@@ -53,6 +55,15 @@ REJOIN_SECONDS = 1.0
 
 NO_ROOT = "0" * 64
 
+CLOSURE_EVENTS = ("overlay.accepted", "overlay.ended")
+"""Events that change the closures in force."""
+
+MAX_CLOSURE_CHANGES = 5
+"""Maximum number of times that a manifest is fetched again in one sync because closures have changed."""
+
+CLOSURES_SECONDS = 0.1
+"""First pause if a server's files have other closures than its newest manifest; doubled each time."""
+
 
 class Agent:
     """One environment's map in one folder. clock: seconds since 1970; it may be a minute off."""
@@ -76,7 +87,8 @@ class Agent:
         self._activation = Activation(
             self._folder, self._store, options, self._robot, log=tell, stopping=self._stopping, retries=self._retries
         )
-        self._downloads = Downloads(self._folder, self._web)
+        self._requests = parse_requests(options.formats, options.optional)
+        self._downloads = Downloads(self._folder, self._web, self._requests)
         self._status = StatusReporter(
             options.environment,
             self._robot,
@@ -88,6 +100,7 @@ class Agent:
         self._latest: tuple[str, str | None, Manifest] | None = None
         self._told: set[str] = set()
         self._preloaded: Manifest | None = None
+        self._preloaded_closures = ""
         self._rejoined = False
         self._in_vain = 0
         self._called = 0
@@ -234,13 +247,16 @@ class Agent:
         ours = {self.options.channel} if self.options.channel else {PRODUCTION, channel}
         if event.type == "version.created":
             concerns = channel in (LATEST, None)
+        elif event.type in CLOSURE_EVENTS:
+            concerns = True  # in force on every channel at once
         elif event.type.startswith("overlay."):
-            concerns = False  # what is accepted of them comes as a version
+            concerns = False
         else:
             concerns = event.channel in ours or event.type.startswith("environment.")
         if concerns:
-            if event.type == "channel.moved" or (event.type == "version.created" and channel == LATEST):
-                self._called = event.sequence  # so far the channel that is followed has moved
+            is_move = event.type == "channel.moved" or (event.type == "version.created" and channel == LATEST)
+            if is_move or (event.type in CLOSURE_EVENTS and self._has_closures):
+                self._called = event.sequence  # so far the manifest of the followed channel has moved
             self._wake.set()
 
     @property
@@ -314,6 +330,7 @@ class Agent:
 
     def _sync(self) -> bool:
         self._store.keep(self._state)
+        write_hooks(self._folder, self.options.on_change, self._robot)
         try:
             plans = self._plans()
         except FleetMapError:
@@ -339,7 +356,7 @@ class Agent:
     def _follow(self, channel: str) -> Outcome:
         """Bring ``current`` to the channel's map and have the robot load it."""
         manifest = self._manifest(channel)
-        outcome = self._install(manifest) if manifest is not None else None
+        outcome = self._install_latest(channel, manifest) if manifest is not None else None
         self._about = None
         loaded = self._activation.load()
         return loaded if outcome is None or outcome.state == "active" else outcome
@@ -376,7 +393,8 @@ class Agent:
 
     def _manifest(self, channel: str, wanted: Callable[[Manifest], bool] = lambda _: True) -> Manifest | None:
         """The channel's manifest, verified; None if the installed one is still it, or it is not wanted."""
-        request_key = f"{channel}?{','.join(self.options.formats)}"
+        query = self._query()
+        request_key = f"{channel}?{query}"
         state, now = self._state, self._clock()
         mark = state.marks.get(channel)
         installed = self._folder.manifest(self._folder.standing)
@@ -387,7 +405,7 @@ class Agent:
             _, known_etag, manifest = self._latest
             if manifest.mark == mark and manifest.expires.timestamp() > now:
                 etag, cached = known_etag, manifest
-        found = self._web.manifest(self.options.environment, channel, self.options.formats, etag)
+        found = self._web.manifest(self.options.environment, channel, query, etag)
         if found is None:
             return cached if cached is not None and wanted(cached) else None
         manifest, key = self._believe(found[0], found[1], channel, mark)
@@ -399,6 +417,22 @@ class Agent:
         self._latest = (request_key, found[2], manifest)
         return manifest
 
+    def _query(self) -> str:
+        """Return the parameters of a manifest's address."""
+        count = len(self.options.formats)
+        query = f"formats={encode_entries(self._requests[:count])}"
+        return f"{query}&optional={encode_entries(self._requests[count:])}" if self.options.optional else query
+
+    @staticmethod
+    def _names(entries: Sequence[str]) -> list[str]:
+        return [entry.partition("?")[0] for entry in entries]
+
+    @property
+    def _has_closures(self) -> bool:
+        """Whether the server applies closures, by the newest manifest."""
+        manifest = self._latest[2] if self._latest else self._folder.manifest(self._folder.standing)
+        return manifest is not None and manifest.overlays_digest is not None
+
     def _believe(self, data: bytes, signature: str, channel: str | None, mark: Mark | None) -> tuple[Manifest, bytes]:
         key = trust.signer(data, signature, self._state.key, self._state.given, self._web.keys)
         manifest = trust.parse(data, signature)
@@ -406,11 +440,26 @@ class Agent:
             manifest,
             environment=self.options.environment,
             channel=channel,
-            formats=self.options.formats,
+            formats=self._names(self.options.formats),
+            optional=self._names(self.options.optional),
             mark=mark,
             now=datetime.fromtimestamp(self._clock(), UTC),
         )
         return manifest, key
+
+    def _install_latest(self, channel: str, manifest: Manifest) -> Outcome:
+        """Install a manifest, or the one that replaces it if closures change during the download."""
+        for attempt in range(MAX_CLOSURE_CHANGES):
+            try:
+                return self._install(manifest)
+            except (ClosuresChanged, NotFound, Invalid, Untrusted) as error:
+                newer = self._manifest(channel) if manifest.overlays_digest is not None else None
+                if newer is None or (newer.map_key == manifest.map_key and not isinstance(error, ClosuresChanged)):
+                    raise
+                if newer.map_key == manifest.map_key and self._stopping.wait(CLOSURES_SECONDS * 2**attempt):
+                    raise Stopped from None  # the server's manifest is older than its files for a moment
+                manifest = newer
+        return self._install(manifest)
 
     def _install(self, manifest: Manifest) -> Outcome:
         """Fetch what is missing, build the version, and switch to it."""
@@ -494,8 +543,10 @@ class Agent:
                 self._preloaded = None
                 self._folder.tidy()
             return
-        if self._preloaded is None or self._preloaded.version != version:
-            found = self._web.manifest(self.options.environment, str(version), self.options.formats)
+        closures = self._latest[2].closures_key if self._latest else ""
+        if self._preloaded is None or (self._preloaded.version, self._preloaded_closures) != (version, closures):
+            closures = "&closures=apply" if self._has_closures else ""
+            found = self._web.manifest(self.options.environment, str(version), self._query() + closures)
             if found is None:
                 return
             manifest, _ = self._believe(found[0], found[1], None, None)
@@ -503,7 +554,7 @@ class Agent:
                 raise Untrusted(f"the manifest is of version {manifest.version}, and {version} was asked for")
             self._about = manifest
             self._downloads.fetch(manifest, self._folder.manifest(self._folder.standing), ())
-            self._preloaded = manifest
+            self._preloaded, self._preloaded_closures = manifest, closures
         self._set_status("ready", None if outcome.state == "active" else outcome.detail, self._preloaded)
 
     # --- status ---
@@ -517,11 +568,23 @@ class Agent:
         if is_planned and what == self._reported:
             return
         self._reported = what
-        if outcome.state == "failed":
+        if outcome.state == "active":
+            self._set_status("active", self._remark())
+        elif outcome.state == "failed":
             if self._set_status("failed", outcome.detail, outcome.manifest):
                 self._tell("failed", detail=outcome.detail)
         else:
-            self._set_status("ready" if outcome.state == "waiting" else "active", outcome.detail, outcome.manifest)
+            self._set_status("ready", outcome.detail, outcome.manifest)
+
+    def _remark(self) -> str | None:
+        """Return what a robot with an active map lacks: optional formats."""
+        current = self._folder.manifest(self._folder.standing)
+        if current is None:
+            return None
+        present = {file.format for file in current.files}
+        lacking = [name for name in self._names(self.options.optional) if name not in present]
+        reasons = [f"{name} ({current.missing[name]})" if name in current.missing else name for name in lacking]
+        return f"without optional {', '.join(reasons)}" if reasons else None
 
     def _report_error(self, error: FleetMapError, *, is_planned: bool = False) -> None:
         if isinstance(error, Busy):
@@ -538,9 +601,9 @@ class Agent:
         subject = about or current
         version, root = (subject.version, subject.root) if subject else (0, NO_ROOT)
         channel = self._state.channel or self.options.channel or LATEST
-        sequence = current.sequence if current else None
+        sequence, overlays = (current.sequence, current.overlays_digest) if current else (None, None)
         detail = detail[: messages.MAX_DETAIL] if detail else None
-        status = RobotStatus(channel, version, root, state, detail, self._time_text(), sequence)
+        status = RobotStatus(channel, version, root, state, detail, self._time_text(), sequence, overlays)
         if not self._status.set(status):
             return False
         if state != "failed":

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from urllib.parse import quote, urlencode
 
 from app.agent.folder import Folder
+from app.agent.requests import FormatRequest
 from app.agent.trust import File, Manifest
 from app.agent.web import Web
 
@@ -13,8 +15,9 @@ from app.agent.web import Web
 class Downloads:
     """Fetch files into a map directory."""
 
-    def __init__(self, folder: Folder, web: Web) -> None:
+    def __init__(self, folder: Folder, web: Web, requests: Sequence[FormatRequest]) -> None:
         self._folder, self._web = folder, web
+        self._parameters = {request.name: request.parameters for request in requests}
 
     def fetch(
         self,
@@ -46,9 +49,22 @@ class Downloads:
         for file in missing:
             ready = self._folder.ready(file)
             if not ready.exists():  # two names can have the same bytes
-                self._web.fetch(manifest.environment, manifest.version, file, ready, self._folder.before(file, old))
+                self._web.fetch(
+                    manifest.environment,
+                    manifest.version,
+                    file,
+                    ready,
+                    self._folder.before(file, old),
+                    query=self._query(file, manifest),
+                    overlays=manifest.overlays_digest,
+                )
             sources[file.path] = ready
         return sources
+
+    def _query(self, file: File, manifest: Manifest) -> str:
+        """Return the parameters of a file's address: those of its format, and that closures are applied."""
+        closures = () if manifest.overlays_digest is None else (("closures", "apply"),)
+        return urlencode((*self._parameters.get(file.format, ()), *closures), quote_via=quote)
 
     def has_all(self, manifest: Manifest) -> bool:
         """Whether every file of a manifest is on the disk."""

@@ -20,6 +20,7 @@ class Options:
 
     Attributes:
         channel: None follows ``production`` if it exists, else ``latest``.
+        formats, optional: entries as ``occupancy_grid?level=L2``; optional ones are installed if the server has them.
         before_switch: commands that decide when the robot may switch to a new map.
         on_change: commands that load a map after the switch.
         key: server key to trust at first contact.
@@ -43,6 +44,7 @@ class Options:
     zenoh_login: Login = field(default_factory=Login)
     ca: Path | None = None
     before_switch: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
 
 
 def robot_name(text: str | None = None) -> str:

@@ -11,6 +11,7 @@ import base64
 import binascii
 import hashlib
 import json
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -42,12 +43,13 @@ _FORBIDDEN = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class File:
-    """A file of a map. name: relative, with ``/`` between folders."""
+    """A file of a map. name: relative, with ``/`` between folders. level: name of the level that it belongs to."""
 
     format: str
     name: str
     size: int
     sha256: str
+    level: str | None = None
 
     @property
     def path(self) -> str:
@@ -56,11 +58,20 @@ class File:
 
 
 @dataclass(frozen=True, slots=True)
+class Level:
+    """A storey. elevation: metres."""
+
+    name: str
+    elevation: float
+
+
+@dataclass(frozen=True, slots=True)
 class Manifest:
     """A signed list of a version's files. data, signature: the signed bytes and the header, as they came.
 
     variables: what the place is called (``FARM_NAME`` …), for who sources ``environment.sh``. layers: layer -> a hash
-    of its content.
+    of its content. time: when it was signed. levels: lowest first. missing: optional format -> why it cannot be given.
+    overlays: closures in force, as the server lists them; overlays_digest is None if the server applies none.
     """
 
     environment: str
@@ -75,6 +86,11 @@ class Manifest:
     variables: Mapping[str, str] = field(default_factory=dict)
     layers: Mapping[str, str] = field(default_factory=dict)
     epoch: int = 0
+    time: datetime | None = None
+    levels: tuple[Level, ...] = ()
+    missing: Mapping[str, str] = field(default_factory=dict)
+    overlays: tuple[Mapping[str, Any], ...] = ()
+    overlays_digest: str | None = None
 
     @property
     def mark(self) -> Mark:
@@ -84,7 +100,12 @@ class Manifest:
     @property
     def map_key(self) -> tuple[Any, ...]:
         """Equal for manifests whose version folders are the same."""
-        return self.root, self.content
+        return self.root, self.closures_key, self.content
+
+    @property
+    def closures_key(self) -> str:
+        """The digest of the closures in force, empty if there are none."""
+        return self.overlays_digest if self.overlays and self.overlays_digest else ""
 
     @property
     def content(self) -> dict[str, str]:
@@ -96,7 +117,8 @@ def parse(data: bytes, signature: str) -> Manifest:
     """The members of a manifest, each checked; Untrusted where they are not what a manifest has."""
     try:
         body = json.loads(data)
-        files = tuple(File(f["format"], f["name"], f["size"], f["sha256"]) for f in body["files"])
+        files = tuple(File(f["format"], f["name"], f["size"], f["sha256"], f.get("level")) for f in body["files"])
+        signed_at = body.get("time")
         expires = datetime.fromisoformat(body["expires"])
         found = Manifest(
             body["environment"],
@@ -111,6 +133,11 @@ def parse(data: bytes, signature: str) -> Manifest:
             dict(body.get("variables", {})),
             dict(body.get("layers", {})),
             body.get("epoch", 0),
+            None if signed_at is None else datetime.fromisoformat(signed_at),
+            tuple(Level(level["name"], level["elevation"]) for level in body.get("levels", [])),
+            {line["format"]: line["detail"] for line in body.get("missing", [])},
+            tuple(body.get("overlays", [])),
+            body.get("overlays_digest"),
         )
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise Untrusted(f"the server's manifest cannot be read: {type(error).__name__}: {error}") from None
@@ -124,9 +151,45 @@ def parse(data: bytes, signature: str) -> Manifest:
         raise Untrusted("the server's manifest cannot be read: a number, a hash or the time of expiry is none")
     _check_paths(files)
     _check_variables(found.variables)
+    _check_site(found)
     if not all(isinstance(t, str) for t in found.layers.values()) or not all(map(_LAYER.fullmatch, found.layers)):
         raise Untrusted("the server's manifest cannot be read: a layer's name or hash is none")
     return found
+
+
+def _check_site(manifest: Manifest) -> None:
+    """Check levels, missing formats, closures and the time of signing."""
+    names = [level.name for level in manifest.levels]
+    problems = (
+        (manifest.time is not None and manifest.time.tzinfo is None, "the time of signing has no zone"),
+        (not all(map(_is_name, names)) or len(set(names)) != len(names), "a level's name is invalid or a duplicate"),
+        (not all(_is_number(level.elevation) for level in manifest.levels), "a level's elevation is not a number"),
+        (not all(f.level is None or f.level in names for f in manifest.files), "a file belongs to an unknown level"),
+        (not all(_is_name(format_) for format_ in manifest.missing), "a missing format has no name"),
+        (not all(isinstance(why, str) for why in manifest.missing.values()), "a missing format has no reason"),
+        (not all(_is_closure(closure) for closure in manifest.overlays), "a closure has no id"),
+        (bool(manifest.overlays) and manifest.overlays_digest is None, "its closures have no digest"),
+        (not _is_digest(manifest.overlays_digest), "the digest of its closures is invalid"),
+    )
+    for is_wrong, problem in problems:
+        if is_wrong:
+            raise Untrusted(f"the server's manifest cannot be read: {problem}")
+
+
+def _is_name(value: object) -> bool:
+    return isinstance(value, str) and value.isprintable() and 0 < len(value.encode("utf-8", "replace")) <= 255
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_closure(value: object) -> bool:
+    return isinstance(value, dict) and _is_name(value.get("id"))
+
+
+def _is_digest(value: object) -> bool:
+    return value is None or (isinstance(value, str) and _HASH.fullmatch(value) is not None)
 
 
 def _check_variables(variables: Mapping[str, str]) -> None:
@@ -231,6 +294,7 @@ def check(
     environment: str,
     channel: str | None,
     formats: Sequence[str],
+    optional: Sequence[str] = (),
     mark: Mark | None,
     now: datetime | None = None,
 ) -> None:
@@ -248,8 +312,11 @@ def check(
             "a clock is wrong"
         )
     got = {file.format for file in manifest.files}
-    if got != set(formats):
-        missing, more = sorted(set(formats) - got), sorted(got - set(formats))
+    for format_, why in manifest.missing.items():
+        if format_ in formats:
+            raise Untrusted(f"the server cannot give the required format {format_}: {why}")
+    if not set(formats) <= got <= {*formats, *optional}:
+        missing, more = sorted(set(formats) - got), sorted(got - set(formats) - set(optional))
         raise Untrusted(f"the manifest is of other formats: without {missing or 'none'}, with {more or 'no'} further")
     if mark is None:
         return

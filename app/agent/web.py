@@ -30,6 +30,9 @@ else:
 
 API = "/api/v1"
 SIGNATURE = "fleetmap-signature"
+OVERLAYS = "fleetmap-overlays"
+"""Header of a map: digest of the closures that were applied to it."""
+
 TIMEOUT = httpx.Timeout(10.0, read=60.0)
 """Seconds. A map that takes its server longer is answered with a job."""
 
@@ -62,6 +65,10 @@ MAX_JOBS = 1000
 
 class Stopped(Exception):
     """The agent was told to end."""
+
+
+class ClosuresChanged(Unavailable):
+    """A file belongs to other closures than its manifest: the manifest is to be fetched again."""
 
 
 class Busy(Unavailable):
@@ -126,6 +133,7 @@ class Web:
         )
         self._stopping = stopping
         self._sockets: list[socket.socket] = []
+        self._overlays: str | None = None
         self.received = 0
         self.deltas = 0
 
@@ -164,13 +172,13 @@ class Web:
         return [line for line in found if isinstance(line, dict)]
 
     def manifest(
-        self, environment: str, ref: str, formats: Iterable[str], etag: str | None = None
+        self, environment: str, ref: str, query: str, etag: str | None = None
     ) -> tuple[bytes, str, str | None] | None:
-        """The signed bytes, the signature, the ETag; None where it is still the one with ``etag``."""
-        asked = ",".join(quote(name, safe="") for name in formats)
-        path = (
-            f"{API}/environments/{quote(environment, safe='')}/versions/{quote(ref, safe='')}/manifest?formats={asked}"
-        )
+        """The signed bytes, the signature, the ETag; None where it is still the one with ``etag``.
+
+        query: the encoded parameters of the address.
+        """
+        path = f"{API}/environments/{quote(environment, safe='')}/versions/{quote(ref, safe='')}/manifest?{query}"
         headers = {"If-None-Match": etag} if etag else {}
         for _ in range(MAX_JOBS):
             with self._stream(path, headers) as answer:
@@ -192,15 +200,32 @@ class Web:
             if answer.status_code >= 300:
                 raise self._refused(answer)
 
-    def fetch(self, environment: str, version: int, file: File, target: Path, old: tuple[Path, str] | None) -> None:
+    def fetch(
+        self,
+        environment: str,
+        version: int,
+        file: File,
+        target: Path,
+        old: tuple[Path, str] | None,
+        *,
+        query: str = "",
+        overlays: str | None = None,
+    ) -> None:
         """A file into ``target``, whole and verified. What a break leaves in ``<target>.part`` is gone on from.
 
-        old: a file that is here, with its SHA-256, that the server may answer with the difference to. Untrusted where
-        the bytes are not those of the manifest.
+        Args:
+            old: a file that is here, with its SHA-256, that the server may answer with the difference to.
+            query: encoded parameters of the address.
+            overlays: digest of the closures in the manifest.
+
+        Raises:
+            ClosuresChanged: the bytes differ because the closures have changed since.
+            Untrusted: the bytes differ from the manifest.
         """
         path = f"{API}/environments/{quote(environment, safe='')}/versions/{version}/maps/"
-        path += f"{quote(file.format, safe='')}/{quote(file.name, safe='/')}"
+        path += f"{quote(file.format, safe='')}/{quote(file.name, safe='/')}{'?' if query else ''}{query}"
         part = target.with_name(target.name + ".part")
+        self._overlays = None
         for _ in range(2):
             fresh = not part.exists()
             if part.exists() and part.stat().st_size > file.size:
@@ -211,6 +236,8 @@ class Web:
                 part.replace(target)
                 return
             part.unlink(missing_ok=True)
+            if overlays is not None and self._overlays not in (None, overlays):
+                raise ClosuresChanged(f"{file.path} has other closures than the manifest")
             if fresh and whole:
                 break
             old = None  # a delta, or a part of before, that did not fit: once more from the start
@@ -228,6 +255,7 @@ class Web:
             dictionary = base64.b64encode(bytes.fromhex(old[1])).decode()
             headers |= {"Available-Dictionary": f":{dictionary}:", "Accept-Encoding": "dcz"}
         with self._stream(path, headers) as answer:
+            self._overlays = answer.headers.get(OVERLAYS)
             if answer.status_code == 416:
                 return False
             if answer.status_code == 202:

@@ -89,7 +89,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """What a robot says of itself. time: RFC 3339, by the robot's clock."""
+    """What a robot says of itself. time: RFC 3339, by the robot's clock. overlays: digest of the closures it holds."""
 
     channel: str
     version: int
@@ -98,6 +98,7 @@ class RobotStatus:
     detail: str | None = None
     time: str | None = None
     sequence: int | None = None
+    overlays: str | None = None
 
     @classmethod
     def from_json(cls, data: bytes | str) -> RobotStatus:
@@ -123,7 +124,7 @@ class RobotStatus:
 
         channel, version, root = body.get("channel"), body.get("version"), body.get("root")
         state, detail, time = body.get("state"), body.get("detail"), body.get("time")
-        sequence = body.get("sequence")
+        sequence, overlays = body.get("sequence"), body.get("overlays")
         whole = isinstance(version, int) and not isinstance(version, bool) and 0 <= version < 2**63
         check("channel", isinstance(channel, str) and _CHANNEL.fullmatch(channel) is not None, "a channel's name")
         check("version", whole, "a version's number")
@@ -133,10 +134,12 @@ class RobotStatus:
         check("time", time is None or (isinstance(time, str) and len(time) <= 64), "an RFC 3339 time")
         numbered = isinstance(sequence, int) and not isinstance(sequence, bool) and 0 <= sequence < 2**63
         check("sequence", sequence is None or numbered, "an event's number")
+        is_digest = isinstance(overlays, str) and _ROOT.fullmatch(overlays) is not None
+        check("overlays", overlays is None or is_digest, "64 hexadecimal digits")
         if problems:
             raise Invalid("; ".join(f"{p.where} {p.problem}" for p in problems), problems)
         known = next(s for s in ROBOT_STATES if s == state)
-        return cls(str(channel), int(version or 0), str(root), known, detail, time, sequence)
+        return cls(str(channel), int(version or 0), str(root), known, detail, time, sequence, overlays)
 
     def as_dict(self) -> dict[str, Any]:
         """The status without its empty members."""
@@ -148,6 +151,7 @@ class RobotStatus:
             "detail": self.detail,
             "time": self.time,
             "sequence": self.sequence,
+            "overlays": self.overlays,
         }
         return {name: value for name, value in members.items() if value is not None}
 

@@ -33,6 +33,10 @@ class Fake:
         self.channels: dict[str, tuple[int, int]] = {}
         self.sequence = 0
         self.more: dict[str, Any] = {}
+        self.closures: list[dict[str, Any]] | None = None
+        """None: a server that applies none. Each is written at the end of every file."""
+        self.levels: dict[str, str] = {}
+        """Path of a file -> level."""
         self.ready: dict[str, Any] = {}
         self.planned: dict[str, Any] = {}
         self.statuses: list[dict[str, Any]] = []
@@ -82,15 +86,29 @@ class Fake:
         self.sequence += 1
         self.channels[channel] = (version, self.sequence)
 
+    def close_edges(self, *edges: str) -> None:
+        """Accept closures of these edges, and end all others."""
+        self.closures = [{"id": edge, "kind": "edge", "level": "ground", "edge": edge} for edge in edges]
+        self.sequence += 1
+        self.channels = {name: (version, self.sequence) for name, (version, _) in self.channels.items()}
+
+    @property
+    def digest(self) -> str:
+        return hashlib.sha256(json.dumps(self.closures or []).encode()).hexdigest()
+
+    def file(self, path: str, version: int) -> bytes:
+        return self.versions[version - 1][path] + "".join(c["id"] for c in self.closures or []).encode()
+
     def manifest(self, ref: str) -> bytes:
         number, sequence = (int(ref), 1) if ref.isdigit() else self.channels[ref]
-        files = self.versions[number - 1]
+        originals = self.versions[number - 1]
+        files = {path: self.file(path, number) for path in originals}
         body = {
             "environment": PLACE,
             **({} if ref.isdigit() else {"channel": ref}),
             "sequence": sequence,
             "version": number,
-            "root": hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest(),
+            "root": hashlib.sha256(repr(sorted(originals.items())).encode()).hexdigest(),
             "expires": (datetime.now(UTC) + timedelta(days=1)).isoformat(),
             "files": [
                 {
@@ -98,11 +116,17 @@ class Fake:
                     "name": path.partition("/")[2],
                     "size": len(data),
                     "sha256": hashlib.sha256(data).hexdigest(),
+                    **({"level": self.levels[path]} if path in self.levels else {}),
                 }
                 for path, data in sorted(files.items())
             ],
-            "layers": {"topology": hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:16]},
+            "layers": {"topology": hashlib.sha256(repr(sorted(originals.items())).encode()).hexdigest()[:16]},
         }
+        if self.closures is not None:
+            body |= {"overlays": self.closures, "overlays_digest": self.digest}
+        if self.levels:
+            names = sorted(set(self.levels.values()))
+            body["levels"] = [{"name": name, "elevation": 3.5 * k} for k, name in enumerate(names)]
         return json.dumps(body | self.more).encode()
 
     def answer(self, handler: BaseHTTPRequestHandler) -> None:
@@ -127,9 +151,10 @@ class Fake:
             key, signature = self.keys.sign(data)
             signed = f"{key}:{base64.b64encode(signature).decode()}"
             return send(handler, 200, data, etag=etag, **{"fleetmap-signature": signed})
-        data = self.versions[int(path[6]) - 1]["/".join(path[8:])]
+        data = self.file("/".join(path[8:]), int(path[6]))
+        more = {} if self.closures is None else {"fleetmap-overlays": self.digest}
         start = int((handler.headers.get("range") or "bytes=0-")[6:-1])
-        return send(handler, 206 if start else 200, data[start:])
+        return send(handler, 206 if start else 200, data[start:], **more)
 
 
 def send(handler: BaseHTTPRequestHandler, status: int, body: bytes, **headers: str) -> None:
