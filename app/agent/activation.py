@@ -7,6 +7,7 @@ drives by.
 
 from __future__ import annotations
 
+import json
 import random
 import threading
 import time
@@ -33,6 +34,10 @@ BEFORE_SWITCH_LIMIT_SECONDS = 60.0
 """Maximum run time of ``--before-switch``."""
 
 MAX_VARIABLE_BYTES = 100_000
+
+HOOK_SUCCESS = ("done", "unchanged")
+MAX_HOOK_STATUS_BYTES = 65_536
+MAX_HOOK_STEPS = 5
 
 LAYERS = ("imagery", "location", "objects", "occupancy", "topology", "voxels", "zones")
 """Layers that may have changed if the server is too old to list them."""
@@ -216,6 +221,7 @@ class Activation:
         if self._options.on_change:  # cut off in the middle, or taken back: what the robot has loaded is unknown
             self._store.set(activated=None)
         variables = self._variables(manifest, before)
+        self._folder.hook_status.unlink(missing_ok=True)
         for command in self._options.on_change:
             problem = hooks.run(command, variables, stopping=self._stopping)
             if problem is not None:
@@ -226,6 +232,11 @@ class Activation:
         self._store.set(activated=name, working=name)
         self.protect()
         return None
+
+    def hook_remark(self) -> str | None:
+        """Return the steps that the hooks of the current version did not do, as they wrote them."""
+        steps = [s for s in read_hook_status(self._folder.hook_status) if s["result"] not in HOOK_SUCCESS]
+        return "; ".join(f"{s['step']}: {s['result']}: {s['detail']}" for s in steps[:MAX_HOOK_STEPS]) or None
 
     def _variables(self, manifest: Manifest, before: Manifest | None) -> dict[str, str]:
         """Return the environment variables of a command. before: what the robot has loaded."""
@@ -254,8 +265,26 @@ def hook_variables(
         "FLEETMAP_ROBOT": robot,
         "FLEETMAP_OVERLAYS": manifest.overlays_digest or "",
         "FLEETMAP_CLOSURES_FILE": str(folder.current / "closures.json"),
+        "FLEETMAP_HOOK_STATUS": str(folder.hook_status),
         **level_variables(manifest, level),
     }
+
+
+def read_hook_status(path: Path) -> list[dict[str, str]]:
+    """Return the steps that hooks wrote to ``FLEETMAP_HOOK_STATUS``: JSON lines ``{"step", "result", "detail"}``."""
+    try:
+        with path.open("rb") as stream:
+            lines = stream.read(MAX_HOOK_STATUS_BYTES).splitlines()
+    except OSError:
+        return []
+    steps = []
+    for line in lines:
+        try:
+            body = json.loads(line)
+            steps.append({name: str(body[name])[:300] for name in ("step", "result", "detail")})
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue  # a line of something else, or cut off
+    return steps
 
 
 def identity(manifest: Manifest) -> str:

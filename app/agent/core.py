@@ -19,6 +19,7 @@ from app.agent.activation import ACTIVE, BEFORE_SWITCH_SECONDS, Activation, LogE
 from app.agent.download import Downloads
 from app.agent.ear import Ear
 from app.agent.folder import Folder
+from app.agent.freshness import Freshness, SignedClock
 from app.agent.levels import write_hooks
 from app.agent.options import Options, robot_name
 from app.agent.requests import encode_entries, parse_requests
@@ -87,6 +88,8 @@ class Agent:
         self._activation = Activation(
             self._folder, self._store, options, self._robot, log=tell, stopping=self._stopping, retries=self._retries
         )
+        self._signed_clock = SignedClock(clock)
+        self._freshness = Freshness(options.poll_seconds, self._time_text)
         self._requests = parse_requests(options.formats, options.optional)
         self._downloads = Downloads(self._folder, self._web, self._requests)
         self._status = StatusReporter(
@@ -121,7 +124,7 @@ class Agent:
         if given is not None and given != state.given:
             if state.key is not None and given not in (trust.key_id(state.key), _text(state.key)):
                 self._tell("trusting", key=given, detail="the key that was pinned before is forgotten")
-                state = dataclasses.replace(state, key=None)
+                state = dataclasses.replace(state, key=None, marks={})
             state = dataclasses.replace(state, given=given)
         installed = self._folder.manifest(self._folder.standing)
         name = self._folder.standing
@@ -129,6 +132,7 @@ class Agent:
             self._tell("damaged", version=installed.version, files=bad[:20])
             state = dataclasses.replace(state, etag=None)
         self._store.stage(state)
+        self._signed_clock.floor = state.newest_time
         self._activation.protect()
         if installed is not None and name is not None:
             self._folder.refresh(name, installed)
@@ -242,7 +246,7 @@ class Agent:
         if event.environment != self.options.environment or not isinstance(event.channel, str | None):
             return
         channel = self._state.channel
-        if event.sequence <= self._mark:
+        if not 0 < event.sequence - self._mark <= trust.MAX_SEQUENCE_AHEAD + 1:
             return
         ours = {self.options.channel} if self.options.channel else {PRODUCTION, channel}
         if event.type == "version.created":
@@ -257,6 +261,7 @@ class Agent:
             is_move = event.type == "channel.moved" or (event.type == "version.created" and channel == LATEST)
             if is_move or (event.type in CLOSURE_EVENTS and self._has_closures):
                 self._called = event.sequence  # so far the manifest of the followed channel has moved
+                self._freshness.announce(event.sequence)
             self._wake.set()
 
     @property
@@ -342,6 +347,8 @@ class Agent:
         outcome: Outcome | None = None
         try:
             outcome = self._follow(channel)
+            if outcome.state == "active" and (problem := self._freshness.stale_problem()) is not None:
+                raise Untrusted(problem)
             self._report(outcome, is_planned=planned is not None)
         except FleetMapError as error:
             if planned is None:
@@ -364,7 +371,7 @@ class Agent:
     def _switch_pending(self) -> bool:
         """Ask ``--before-switch`` again for the map that waits for it."""
         pending, self._activation.pending = self._activation.pending, None
-        if pending is None or pending.manifest.expires.timestamp() < self._clock():
+        if pending is None or pending.manifest.expires.timestamp() < self._signed_clock.now():
             return False
         outcome = self._switch(pending.name, pending.manifest, pending.members, pending.since)
         if outcome.state == "active":
@@ -395,7 +402,7 @@ class Agent:
         """The channel's manifest, verified; None if the installed one is still it, or it is not wanted."""
         query = self._query()
         request_key = f"{channel}?{query}"
-        state, now = self._state, self._clock()
+        state, now = self._state, self._signed_clock.now()
         mark = state.marks.get(channel)
         installed = self._folder.manifest(self._folder.standing)
         etag, cached = None, None
@@ -411,6 +418,11 @@ class Agent:
         manifest, key = self._believe(found[0], found[1], channel, mark)
         if not wanted(manifest):
             return None
+        if state.key is not None and state.key != key:  # endorsed: what an old key signed is no measure any more
+            state = dataclasses.replace(state, marks={})
+            self._signed_clock.floor = 0.0
+        self._signed_clock.observe(manifest)
+        state = dataclasses.replace(state, newest_time=self._signed_clock.floor)
         if state.key != key:
             self._tell("trusting", key=trust.key_id(key), detail="rotated" if state.key else "first contact")
         self._store.keep(dataclasses.replace(state, key=key).marked(channel, manifest.mark))
@@ -434,7 +446,8 @@ class Agent:
         return manifest is not None and manifest.overlays_digest is not None
 
     def _believe(self, data: bytes, signature: str, channel: str | None, mark: Mark | None) -> tuple[Manifest, bytes]:
-        key = trust.signer(data, signature, self._state.key, self._state.given, self._web.keys)
+        pinned = self._state.key
+        key = trust.signer(data, signature, pinned, self._state.given, self._web.keys)
         manifest = trust.parse(data, signature)
         trust.check(
             manifest,
@@ -442,9 +455,10 @@ class Agent:
             channel=channel,
             formats=self._names(self.options.formats),
             optional=self._names(self.options.optional),
-            mark=mark,
-            now=datetime.fromtimestamp(self._clock(), UTC),
+            mark=mark if pinned in (None, key) else None,
+            now=datetime.fromtimestamp(self._signed_clock.now(), UTC),
         )
+        self._freshness.observe(manifest)
         return manifest, key
 
     def _install_latest(self, channel: str, manifest: Manifest) -> Outcome:
@@ -482,7 +496,8 @@ class Agent:
             self._folder.describe(pending.name, manifest)
             return self._switch(pending.name, manifest, pending.members, pending.since)
         self._activation.pending = None
-        received, deltas, begun = self._web.received, self._web.deltas, time.monotonic()
+        web, begun = self._web, time.monotonic()
+        received, deltas, failed_deltas = web.received, web.deltas, web.failed_deltas
         ready = self._preloaded.files if self._preloaded else ()
         sources = self._downloads.fetch(
             manifest, installed, ready, lambda: self._set_status("downloading", about=manifest)
@@ -495,10 +510,12 @@ class Agent:
             "channel": manifest.channel,
             "sequence": manifest.sequence,
             "files": len(changed_files(installed, manifest)),
-            "bytes": self._web.received - received,
-            "deltas": self._web.deltas - deltas,
+            "bytes": web.received - received,
+            "deltas": web.deltas - deltas,
             "seconds": round(time.monotonic() - begun, 3),
         }
+        if (count := web.failed_deltas - failed_deltas) > 0:
+            members["detail"] = f"{count} deltas could not be decoded: fetched the complete files instead"
         return self._switch(self._folder.build(manifest, sources), manifest, members, self._time_text()[:19] + "Z")
 
     def _switch(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
@@ -577,14 +594,16 @@ class Agent:
             self._set_status("ready", outcome.detail, outcome.manifest)
 
     def _remark(self) -> str | None:
-        """Return what a robot with an active map lacks: optional formats."""
+        """Return what a robot with an active map lacks: optional formats, or news that the bus announced."""
         current = self._folder.manifest(self._folder.standing)
         if current is None:
             return None
         present = {file.format for file in current.files}
         lacking = [name for name in self._names(self.options.optional) if name not in present]
         reasons = [f"{name} ({current.missing[name]})" if name in current.missing else name for name in lacking]
-        return f"without optional {', '.join(reasons)}" if reasons else None
+        lacks = f"without optional {', '.join(reasons)}" if reasons else None
+        remarks = (lacks, self._freshness.behind_remark(self._mark), self._activation.hook_remark())
+        return "; ".join(remark for remark in remarks if remark) or None
 
     def _report_error(self, error: FleetMapError, *, is_planned: bool = False) -> None:
         if isinstance(error, Busy):

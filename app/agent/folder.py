@@ -8,7 +8,8 @@
     DIR/versions/7-9f3c21aa-0b12cd34         the same root with closures of this digest in force
     DIR/partial/<sha256>[.part]              what was fetched, whole or not yet
     DIR/state.json, DIR/lock, DIR/changed    the last: what the hooks were told that changed
-    DIR/hooks.json, DIR/hooks.lock, DIR/level  the hooks, held while they run; the level that the robot is on
+    DIR/hooks.json, DIR/hooks.lock           the hooks, for agent-level; held while they run
+    DIR/hook-status, DIR/level               what the hooks did; the level that the robot is on
 
 Files that did not change are hard links to those of the version before, so they are read-only.
 """
@@ -53,6 +54,7 @@ class Folder:
         self.versions = self.path / "versions"
         self.partial = self.path / "partial"
         self.state = self.path / "state.json"
+        self.hook_status = self.path / "hook-status"
         self.protected: frozenset[str] = frozenset()
         """Names of versions that are never removed: they may be switched to again."""
         self._lock: IO[str] | None = None

@@ -99,6 +99,7 @@ def load_level(
         if level not in names:
             choice = f"choose one of {', '.join(names)}" if names else "the server lists no levels"
             raise NotFound(f"unknown level {level[:80]!r}: {choice}")
+        folder.hook_status.unlink(missing_ok=True)
         values = variables(folder, manifest, level_files(manifest, level), sorted(manifest.layers), level, robot)
         for command in commands:
             if (problem := hooks.run(command, values)) is not None:

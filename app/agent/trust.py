@@ -27,6 +27,14 @@ from app.errors import Untrusted
 CLOCKS_DIFFER = timedelta(seconds=60)
 """How far a robot's clock may be from the server's."""
 
+MAX_SEQUENCE_AHEAD = 10**9
+"""Maximum distance of a manifest's sequence from the highest accepted one: a stolen key cannot make all later ones look
+old with a single manifest.
+"""
+
+MAX_EPOCH_AHEAD = 2**32
+"""The same for epochs, with room for those that are a time in seconds."""
+
 MAX_FILES = 100_000
 MAX_VARIABLES = 2000
 MAX_DEPTH = 100
@@ -308,8 +316,9 @@ def check(
         raise Untrusted(f"the manifest is of the channel {manifest.channel!r}, not of {channel!r}")
     if manifest.expires < (now or datetime.now(UTC)) - CLOCKS_DIFFER:
         raise Untrusted(
-            f"the manifest has expired at {manifest.expires:%Y-%m-%d %H:%M:%S} UTC: somebody hands out an old one, or "
-            "a clock is wrong"
+            f"the manifest has expired at {manifest.expires:%Y-%m-%d %H:%M:%S} UTC, and it is "
+            f"{now or datetime.now(UTC):%Y-%m-%d %H:%M:%S} by the newer of this robot's clock and the newest signed "
+            "time: possible replay of an old one. Check both clocks"
         )
     got = {file.format for file in manifest.files}
     for format_, why in manifest.missing.items():
@@ -318,6 +327,7 @@ def check(
     if not set(formats) <= got <= {*formats, *optional}:
         missing, more = sorted(set(formats) - got), sorted(got - set(formats) - set(optional))
         raise Untrusted(f"the manifest is of other formats: without {missing or 'none'}, with {more or 'no'} further")
+    _check_ahead(manifest, mark)
     if mark is None:
         return
     if (manifest.epoch, manifest.sequence) < (mark.epoch, mark.sequence):
@@ -331,6 +341,20 @@ def check(
             f"the manifest of sequence {manifest.sequence} has the root {manifest.root[:8]}, and {mark.root[:8]} was "
             "seen under the same number: there are two servers with one key. If it was restored, remove state.json"
         )
+
+
+def _check_ahead(manifest: Manifest, mark: Mark | None) -> None:
+    """Refuse a position that is too far ahead of the last accepted one."""
+    epoch, sequence = (mark.epoch, mark.sequence) if mark is not None else (0, 0)
+    for name, value, accepted, limit in (
+        ("sequence", manifest.sequence, sequence, MAX_SEQUENCE_AHEAD),
+        ("epoch", manifest.epoch, epoch, MAX_EPOCH_AHEAD),
+    ):
+        if value > accepted + limit:
+            raise Untrusted(
+                f"manifest {name} {value} is more than {limit} ahead of {accepted}, the last one that this robot has "
+                "accepted: rotate the server's key if it may be stolen"
+            )
 
 
 def _verifies(public: bytes, signature: bytes, data: bytes) -> bool:

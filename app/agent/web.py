@@ -43,8 +43,11 @@ WATCH_SECONDS = 0.5
 WHOLE_SECONDS = 300.0
 """Until a manifest or another small answer has come."""
 
-PACE_SECONDS, PACE_BYTES = 60.0, 4096
-"""A file's bytes come at least so fast, else its server is as good as away. What came is gone on from."""
+PACE_SECONDS = 60.0
+MIN_BYTES_PER_SECOND = 4096
+"""Minimum pace of a response, averaged over each PACE_SECONDS and over the whole. A slower one counts as failed; the
+next attempt continues with what came.
+"""
 
 MAX_MANIFEST_BYTES = 32 * 2**20
 MAX_JSON_BYTES = 4 * 2**20
@@ -69,6 +72,10 @@ class Stopped(Exception):
 
 class ClosuresChanged(Unavailable):
     """A file belongs to other closures than its manifest: the manifest is to be fetched again."""
+
+
+class UnreadableDelta(Untrusted):
+    """A delta that does not give a file: the complete file is to be fetched."""
 
 
 class Busy(Unavailable):
@@ -136,6 +143,7 @@ class Web:
         self._overlays: str | None = None
         self.received = 0
         self.deltas = 0
+        self.failed_deltas = 0
 
     def _trust(self, ca: Path | None) -> ssl.SSLContext | bool:
         if ca is not None:
@@ -230,7 +238,13 @@ class Web:
             fresh = not part.exists()
             if part.exists() and part.stat().st_size > file.size:
                 part.unlink()
-            whole = self._receive(path, part, file, old if fresh else None)
+            try:
+                whole = self._receive(path, part, file, old if fresh else None)
+            except UnreadableDelta:
+                self.failed_deltas += 1
+                part.unlink(missing_ok=True)
+                old = None
+                continue
             if _complete(part, file):
                 part.chmod(0o444)
                 part.replace(target)
@@ -297,16 +311,21 @@ class Web:
 
     def _chunks(self, answer: httpx.Response) -> Iterator[bytes]:
         """What came, as it came: larger pieces would be lost where the line breaks before they are full."""
-        begun, since = time.monotonic(), 0
+        begun = window = time.monotonic()
+        total = since = 0
         for chunk in answer.iter_raw():
             if self._stopping.is_set():
                 raise Stopped
             self.received += len(chunk)
-            since += len(chunk)
-            if time.monotonic() - begun > PACE_SECONDS:
-                if since < PACE_BYTES:
-                    raise Unavailable(f"{self.server} has sent {since} bytes in {PACE_SECONDS:g} seconds")
-                begun, since = time.monotonic(), 0
+            total, since, now = total + len(chunk), since + len(chunk), time.monotonic()
+            if now - window > PACE_SECONDS:
+                for count, seconds in ((since, now - window), (total, now - begun)):
+                    if count < MIN_BYTES_PER_SECOND * seconds:
+                        raise Unavailable(
+                            f"{self.server} has sent {count} bytes in {seconds:.0f} seconds, less than "
+                            f"{MIN_BYTES_PER_SECOND} a second: the download goes on later"
+                        )
+                window, since = now, 0
             yield chunk
 
     def _whole(self, answer: httpx.Response, limit: int) -> bytes:
@@ -434,7 +453,7 @@ def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: File) -> Iterato
         if len(head) >= len(want):
             break
     if head[: len(want)] != want:
-        raise Untrusted(f"{file.path}: the delta is not one to the file that is here")
+        raise UnreadableDelta(f"{file.path}: the delta is not one to the file that is here")
     decoder = zstd.ZstdDecompressor(
         zstd.ZstdDict(where.read_bytes(), is_raw=True).as_prefix,
         options={zstd.DecompressionParameter.window_log_max: WINDOW_LOG},
@@ -446,9 +465,9 @@ def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: File) -> Iterato
             out = decoder.decompress(data, max_length=1 << 20)
             made += len(out)
             if made > file.size:
-                raise Untrusted(f"{file.path}: the delta unfolds to more bytes than the manifest says")
+                raise UnreadableDelta(f"{file.path}: the delta unfolds to more bytes than the manifest says")
             if out:
                 yield out
             data = b"" if not decoder.needs_input else next(chunks, None)
     except zstd.ZstdError as error:
-        raise Untrusted(f"{file.path}: the delta cannot be read: {error}") from None
+        raise UnreadableDelta(f"{file.path}: the delta cannot be read: {error}") from None

@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import json
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -35,6 +36,7 @@ class Fake:
         self.more: dict[str, Any] = {}
         self.closures: list[dict[str, Any]] | None = None
         """None: a server that applies none. Each is written at the end of every file."""
+        self.signs_time = True
         self.levels: dict[str, str] = {}
         """Path of a file -> level."""
         self.ready: dict[str, Any] = {}
@@ -127,6 +129,8 @@ class Fake:
         if self.levels:
             names = sorted(set(self.levels.values()))
             body["levels"] = [{"name": name, "elevation": 3.5 * k} for k, name in enumerate(names)]
+        if self.signs_time:
+            body["time"] = datetime.now(UTC).isoformat()
         return json.dumps(body | self.more).encode()
 
     def answer(self, handler: BaseHTTPRequestHandler) -> None:
@@ -186,12 +190,18 @@ class One:
     """An agent in this process: ``lines`` is what it told."""
 
     def __init__(
-        self, fake: Fake, into: Path, *on_change: str, formats: tuple[str, ...] = ("kml",), **more: Any
+        self,
+        fake: Fake,
+        into: Path,
+        *on_change: str,
+        formats: tuple[str, ...] = ("kml",),
+        clock: Callable[[], float] = time.time,
+        **more: Any,
     ) -> None:
         self.into = into
         self.lines: list[dict[str, Any]] = []
         options = Options(fake.url, PLACE, formats, into, robot="robot", on_change=on_change, **more)
-        self.agent = Agent(options, lambda what, **members: self.lines.append({"event": what, **members}))
+        self.agent = Agent(options, lambda what, **members: self.lines.append({"event": what, **members}), clock)
 
     def once(self) -> bool:
         """Take the folder, sync once, let go."""
