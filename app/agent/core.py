@@ -194,10 +194,10 @@ class Agent:
                 self._in_vain = self._in_vain + 1 if vain else 0
                 if failures or self._behind:
                     pause = min(pause, FIRST_PAUSE_SECONDS * 2 ** min(20, max(failures, self._behind) - 1))
-                pause = max(self._after, pause * random.uniform(0.5, 1.5))  # noqa: S311  jitter is no secret
+                pause *= random.uniform(0.5, 1.5)  # noqa: S311  jitter is no secret
                 if (due := self._retries.next_due) is not None:
                     pause = min(pause, max(0.0, due - time.monotonic()))
-                woken = self._rest_or_switch(pause)
+                woken = self._rest_or_switch(max(self._after, pause))
             except Stopped:
                 break
 
