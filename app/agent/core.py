@@ -21,9 +21,10 @@ from app.agent.ear import Ear
 from app.agent.folder import Folder
 from app.agent.freshness import Freshness, SignedClock
 from app.agent.levels import write_hooks
+from app.agent.manifests import Manifests
 from app.agent.options import Options, robot_name
-from app.agent.requests import encode_entries, parse_requests
-from app.agent.state import Mark, State, StateStore
+from app.agent.requests import parse_requests
+from app.agent.state import State, StateStore
 from app.agent.status import StatusReporter
 from app.agent.trust import Manifest
 from app.agent.web import Busy, ClosuresChanged, Stopped, Web
@@ -90,8 +91,18 @@ class Agent:
         )
         self._signed_clock = SignedClock(clock)
         self._freshness = Freshness(options.poll_seconds, self._time_text)
-        self._requests = parse_requests(options.formats, options.optional)
-        self._downloads = Downloads(self._folder, self._web, self._requests)
+        requests = parse_requests(options.formats, options.optional)
+        self._downloads = Downloads(self._folder, self._web, requests)
+        self._manifests = Manifests(
+            options,
+            requests,
+            self._web,
+            self._folder,
+            self._store,
+            clock=self._signed_clock,
+            freshness=self._freshness,
+            log=tell,
+        )
         self._status = StatusReporter(
             options.environment,
             self._robot,
@@ -100,7 +111,6 @@ class Agent:
             lambda reason: self._tell_once("status", detail=reason),
         )
         self._reported: tuple[Any, ...] | None = None
-        self._latest: tuple[str, str | None, Manifest] | None = None
         self._told: set[str] = set()
         self._preloaded: Manifest | None = None
         self._preloaded_closures = ""
@@ -259,7 +269,7 @@ class Agent:
             concerns = event.channel in ours or event.type.startswith("environment.")
         if concerns:
             is_move = event.type == "channel.moved" or (event.type == "version.created" and channel == LATEST)
-            if is_move or (event.type in CLOSURE_EVENTS and self._has_closures):
+            if is_move or (event.type in CLOSURE_EVENTS and self._manifests.has_closures):
                 self._called = event.sequence  # so far the manifest of the followed channel has moved
                 self._freshness.announce(event.sequence)
             self._wake.set()
@@ -335,7 +345,7 @@ class Agent:
 
     def _sync(self) -> bool:
         self._store.keep(self._state)
-        write_hooks(self._folder, self.options.on_change, self._robot)
+        self._write_hooks()
         try:
             plans = self._plans()
         except FleetMapError:
@@ -360,9 +370,15 @@ class Agent:
             self._preload(planned, outcome)
         return outcome.state == "active"
 
+    def _write_hooks(self) -> None:
+        try:
+            write_hooks(self._folder, self.options.on_change, self._robot)
+        except OSError as error:  # a full disk stops agent-level, and not the agent
+            self._tell_once("hooks", detail=f"{self._folder.path}/hooks.json cannot be written: {error.strerror}")
+
     def _follow(self, channel: str) -> Outcome:
         """Bring ``current`` to the channel's map and have the robot load it."""
-        manifest = self._manifest(channel)
+        manifest = self._manifests.latest(channel)
         outcome = self._install_latest(channel, manifest) if manifest is not None else None
         self._about = None
         loaded = self._activation.load()
@@ -398,76 +414,13 @@ class Agent:
         self._tell_once("following", channel=LATEST, detail="no channel production stands on a version yet")
         return LATEST
 
-    def _manifest(self, channel: str, wanted: Callable[[Manifest], bool] = lambda _: True) -> Manifest | None:
-        """The channel's manifest, verified; None if the installed one is still it, or it is not wanted."""
-        query = self._query()
-        request_key = f"{channel}?{query}"
-        state, now = self._state, self._signed_clock.now()
-        mark = state.marks.get(channel)
-        installed = self._folder.manifest(self._folder.standing)
-        etag, cached = None, None
-        if state.asked == request_key and state.expires > now and installed is not None and installed.mark == mark:
-            etag = state.etag  # else "not modified" would be said of a map that does not stand
-        elif self._latest is not None and self._latest[0] == request_key:
-            _, known_etag, manifest = self._latest
-            if manifest.mark == mark and manifest.expires.timestamp() > now:
-                etag, cached = known_etag, manifest
-        found = self._web.manifest(self.options.environment, channel, query, etag)
-        if found is None:
-            return cached if cached is not None and wanted(cached) else None
-        manifest, key = self._believe(found[0], found[1], channel, mark)
-        if not wanted(manifest):
-            return None
-        if state.key is not None and state.key != key:  # endorsed: what an old key signed is no measure any more
-            state = dataclasses.replace(state, marks={})
-            self._signed_clock.floor = 0.0
-        self._signed_clock.observe(manifest)
-        state = dataclasses.replace(state, newest_time=self._signed_clock.floor)
-        if state.key != key:
-            self._tell("trusting", key=trust.key_id(key), detail="rotated" if state.key else "first contact")
-        self._store.keep(dataclasses.replace(state, key=key).marked(channel, manifest.mark))
-        self._latest = (request_key, found[2], manifest)
-        return manifest
-
-    def _query(self) -> str:
-        """Return the parameters of a manifest's address."""
-        count = len(self.options.formats)
-        query = f"formats={encode_entries(self._requests[:count])}"
-        return f"{query}&optional={encode_entries(self._requests[count:])}" if self.options.optional else query
-
-    @staticmethod
-    def _names(entries: Sequence[str]) -> list[str]:
-        return [entry.partition("?")[0] for entry in entries]
-
-    @property
-    def _has_closures(self) -> bool:
-        """Whether the server applies closures, by the newest manifest."""
-        manifest = self._latest[2] if self._latest else self._folder.manifest(self._folder.standing)
-        return manifest is not None and manifest.overlays_digest is not None
-
-    def _believe(self, data: bytes, signature: str, channel: str | None, mark: Mark | None) -> tuple[Manifest, bytes]:
-        pinned = self._state.key
-        key = trust.signer(data, signature, pinned, self._state.given, self._web.keys)
-        manifest = trust.parse(data, signature)
-        trust.check(
-            manifest,
-            environment=self.options.environment,
-            channel=channel,
-            formats=self._names(self.options.formats),
-            optional=self._names(self.options.optional),
-            mark=mark if pinned in (None, key) else None,
-            now=datetime.fromtimestamp(self._signed_clock.now(), UTC),
-        )
-        self._freshness.observe(manifest)
-        return manifest, key
-
     def _install_latest(self, channel: str, manifest: Manifest) -> Outcome:
         """Install a manifest, or the one that replaces it if closures change during the download."""
         for attempt in range(MAX_CLOSURE_CHANGES):
             try:
                 return self._install(manifest)
             except (ClosuresChanged, NotFound, Invalid, Untrusted) as error:
-                newer = self._manifest(channel) if manifest.overlays_digest is not None else None
+                newer = self._manifests.latest(channel) if manifest.overlays_digest is not None else None
                 if newer is None or (newer.map_key == manifest.map_key and not isinstance(error, ClosuresChanged)):
                     raise
                 if newer.map_key == manifest.map_key and self._stopping.wait(CLOSURES_SECONDS * 2**attempt):
@@ -526,9 +479,7 @@ class Agent:
 
     def _installed(self, manifest: Manifest) -> None:
         """Note the ETag of the manifest that is now the current one, and remove what is no longer needed."""
-        request_key, etag, latest = self._latest or ("", None, None)
-        if latest is not None and latest.data == manifest.data:
-            self._store.set(etag=etag, asked=request_key, expires=manifest.expires.timestamp())
+        self._manifests.note_installed(manifest)
         self._folder.tidy(self._preloaded.files if self._preloaded else ())
 
     def _overtaken(self, manifest: Manifest, seconds: float) -> Manifest | None:
@@ -545,7 +496,7 @@ class Agent:
             return self._downloads.has_all(newer)
 
         try:
-            return self._manifest(manifest.channel, here)
+            return self._manifests.latest(manifest.channel, here)
         except FleetMapError:
             return None  # the next look tells of it
 
@@ -560,15 +511,9 @@ class Agent:
                 self._preloaded = None
                 self._folder.tidy()
             return
-        closures = self._latest[2].closures_key if self._latest else ""
+        closures = self._manifests.closures_key
         if self._preloaded is None or (self._preloaded.version, self._preloaded_closures) != (version, closures):
-            closures = "&closures=apply" if self._has_closures else ""
-            found = self._web.manifest(self.options.environment, str(version), self._query() + closures)
-            if found is None:
-                return
-            manifest, _ = self._believe(found[0], found[1], None, None)
-            if manifest.version != version:
-                raise Untrusted(f"the manifest is of version {manifest.version}, and {version} was asked for")
+            manifest = self._manifests.planned(version)
             self._about = manifest
             self._downloads.fetch(manifest, self._folder.manifest(self._folder.standing), ())
             self._preloaded, self._preloaded_closures = manifest, closures
@@ -598,11 +543,11 @@ class Agent:
         current = self._folder.manifest(self._folder.standing)
         if current is None:
             return None
-        present = {file.format for file in current.files}
-        lacking = [name for name in self._names(self.options.optional) if name not in present]
-        reasons = [f"{name} ({current.missing[name]})" if name in current.missing else name for name in lacking]
-        lacks = f"without optional {', '.join(reasons)}" if reasons else None
-        remarks = (lacks, self._freshness.behind_remark(self._mark), self._activation.hook_remark())
+        remarks = (
+            self._manifests.missing_remark(current),
+            self._freshness.behind_remark(self._mark),
+            self._activation.hook_remark(),
+        )
         return "; ".join(remark for remark in remarks if remark) or None
 
     def _report_error(self, error: FleetMapError, *, is_planned: bool = False) -> None:
