@@ -18,6 +18,9 @@ CONFIRM_SECONDS = 60.0
 changes at once spreads its confirmations over this time.
 """
 
+FIRST_CONFIRM_SECONDS = 2.0
+"""The same for the first status after the start: a robot counts in roll-outs once it has reported with its token."""
+
 REPEAT_SECONDS = 30.0
 """Interval after which a robot without Zenoh repeats its status with the next sync."""
 
@@ -48,6 +51,7 @@ class StatusReporter:
         """Monotonic time at which ``send`` has to be called again, if any."""
         self._sent_http: RobotStatus | None = None
         self._sent_http_at = 0.0
+        self._is_confirmed = False
         self._sent_zenoh: RobotStatus | None = None
 
     def set(self, status: RobotStatus) -> bool:
@@ -79,7 +83,8 @@ class StatusReporter:
                 self._sent_zenoh = status
             if _same(status, self._sent_zenoh):
                 if self.confirm_at is None:
-                    self.confirm_at = now + CONFIRM_SECONDS * random.uniform(0.25, 1.0)  # noqa: S311
+                    longest = CONFIRM_SECONDS if self._is_confirmed else FIRST_CONFIRM_SECONDS
+                    self.confirm_at = now + longest * random.uniform(0.25, 1.0)  # noqa: S311
                 if now < self.confirm_at:
                     return
         self.confirm_at = now + CONFIRM_SECONDS  # if this attempt fails
@@ -91,6 +96,7 @@ class StatusReporter:
         except FleetMapError as error:
             self._refused(f"the server does not take the robot's status: {error.detail}")
         self._sent_http, self._sent_http_at, self.confirm_at = status, now, None
+        self._is_confirmed = True
 
 
 def _same(one: RobotStatus, other: RobotStatus | None) -> bool:

@@ -89,7 +89,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """What a robot says of itself. time: RFC 3339, by the robot's clock. overlays: digest of the closures it holds."""
+    """A robot's report of itself. time: RFC 3339, by the robot's clock. overlays: digest of the closures in its map."""
 
     channel: str
     version: int
@@ -134,8 +134,8 @@ class RobotStatus:
         check("time", time is None or (isinstance(time, str) and len(time) <= 64), "an RFC 3339 time")
         numbered = isinstance(sequence, int) and not isinstance(sequence, bool) and 0 <= sequence < 2**63
         check("sequence", sequence is None or numbered, "an event's number")
-        is_digest = isinstance(overlays, str) and _ROOT.fullmatch(overlays) is not None
-        check("overlays", overlays is None or is_digest, "64 hexadecimal digits")
+        hashed = isinstance(overlays, str) and _ROOT.fullmatch(overlays) is not None
+        check("overlays", overlays is None or hashed, "64 hexadecimal digits")
         if problems:
             raise Invalid("; ".join(f"{p.where} {p.problem}" for p in problems), problems)
         known = next(s for s in ROBOT_STATES if s == state)
