@@ -1,36 +1,41 @@
-"""The loop: hear or poll, verify, fetch what differs, switch, run the hooks, tell."""
+"""Sync loop of the agent: wait for an event or poll, verify the manifest, fetch what differs, switch, report."""
 
 from __future__ import annotations
 
 import base64
 import dataclasses
-import errno
 import random
 import re
-import socket
 import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from app.agent import hooks, trust
+from app.agent import trust
+from app.agent.activation import ACTIVE, BEFORE_SWITCH_SECONDS, Activation, LogEvent, Outcome, Retries, changed_files
+from app.agent.download import Downloads
 from app.agent.ear import Ear
 from app.agent.folder import Folder
-from app.agent.state import State, load, save, write_whole
-from app.agent.trust import File, Manifest
-from app.agent.web import Busy, Stopped, Web
-from app.errors import FleetMapError, Invalid, NotFound, Unavailable, Untrusted
+from app.agent.freshness import Freshness, SignedClock
+from app.agent.levels import write_hooks
+from app.agent.manifests import Manifests
+from app.agent.options import Options, robot_name
+from app.agent.requests import parse_requests
+from app.agent.state import State, StateStore
+from app.agent.status import StatusReporter
+from app.agent.trust import Manifest
+from app.agent.web import Busy, ClosuresChanged, Stopped, Web
+from app.errors import FleetMapError, Invalid, NotFound, Untrusted
 from app.events import messages
-from app.events.login import Login
 from app.events.messages import RobotState, RobotStatus
+
+__all__ = ["Agent", "Options", "robot_name"]
 
 LATEST = "latest"
 PRODUCTION = "production"
-POLL_SECONDS = 60.0
 FIRST_PAUSE_SECONDS = 1.0
 """After the first failure; doubled each time up to the pause between polls."""
 
@@ -40,13 +45,9 @@ an open router anybody can put events.
 """
 
 MAX_DOUBLINGS = 8
-LAYERS = ("imagery", "location", "objects", "occupancy", "topology", "voxels", "zones")
-"""What may have changed, where the server is too old to tell."""
 
 ROUTER = re.compile(r"(tcp|tls|quic|udp|ws|wss)/[A-Za-z0-9_.:%\[\]-]+")
 """A router as a server may tell it: no device, no local socket, nothing (``#…``) that would weaken the robot's TLS."""
-
-MAX_VARIABLE_BYTES = 100_000
 
 LONG_SECONDS = 5.0
 """After a longer download the channel is looked at again before the switch."""
@@ -54,59 +55,22 @@ LONG_SECONDS = 5.0
 REJOIN_SECONDS = 1.0
 """A fleet that finds its router again does not ask in the same moment: up to so long."""
 
-CONFIRM_SECONDS = 60.0
-"""What was said over Zenoh is said over HTTP as well within so long, where it still holds then: on the bus nobody
-confirms that he heard it. A fleet that changes at once does so spread over this time.
-"""
-
-FIRST_CONFIRM_SECONDS = 2.0
-"""The same for the first status after the start."""
-
-AGAIN_SECONDS = 30.0
-"""A robot without Zenoh repeats its status with the first sync after so long."""
-
 NO_ROOT = "0" * 64
 
-Tell = Callable[..., None]
-"""tell(what, **members): one line of what happens."""
+CLOSURE_EVENTS = ("overlay.accepted", "overlay.ended")
+"""Events that change the closures in force."""
 
+MAX_CLOSURE_CHANGES = 5
+"""Maximum number of times that a manifest is fetched again in one sync because closures have changed."""
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """How to run. channel: None follows production where there is one, else latest. key: to trust at first contact.
-
-    zenoh_login: at the router; a password without a user is the robot's. ca: who signs the server's certificate.
-    """
-
-    server: str
-    environment: str
-    formats: tuple[str, ...]
-    into: Path
-    channel: str | None = None
-    robot: str = ""
-    on_change: tuple[str, ...] = ()
-    token: str | None = None
-    key: str | None = None
-    poll_seconds: float = POLL_SECONDS
-    zenoh_connect: str | None = None
-    zenoh_prefix: str | None = None
-    zenoh_config: Path | None = None
-    zenoh_login: Login = field(default_factory=Login)
-    ca: Path | None = None
-
-
-def robot_name(text: str | None = None) -> str:
-    """A robot's name as it may be part of a key; the host's where none is given. Invalid."""
-    name = text or re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()).lstrip("_.-") or "robot"
-    if not messages.ROBOT_NAME.fullmatch(name):
-        raise Invalid(f"a robot's name is of letters, digits, dots, - and _, got {name!r}")
-    return name
+CLOSURES_SECONDS = 0.1
+"""First pause if a server's files have other closures than its newest manifest; doubled each time."""
 
 
 class Agent:
     """One environment's map in one folder. clock: seconds since 1970; it may be a minute off."""
 
-    def __init__(self, options: Options, tell: Tell, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, options: Options, tell: LogEvent, clock: Callable[[], float] = time.time) -> None:
         if options.key is not None:
             options = dataclasses.replace(options, key=trust.check_given(options.key))
         self.options, self._tell, self._clock = options, tell, clock
@@ -120,39 +84,66 @@ class Agent:
         self._folder = Folder(options.into)
         self._web = Web(options.server, options.token, self._stopping, options.ca)
         self._ear: Ear | None = None
-        self._state = State(options.environment)
-        self._said: RobotStatus | None = None
-        self._put: RobotStatus | None = None
-        self._put_at = 0.0
-        self._on_bus: RobotStatus | None = None
-        self._confirm_at: float | None = None
-        self._confirmed = False
-        self._target: tuple[int, str] | None = None
-        self._activated: tuple[str | None, tuple[int, str] | None] | None = None
+        self._store = StateStore(self._folder.state, options.environment, self._folder.spare)
+        self._retries = Retries(options.poll_seconds, lambda: FIRST_PAUSE_SECONDS)
+        self._activation = Activation(
+            self._folder, self._store, options, self._robot, log=tell, stopping=self._stopping, retries=self._retries
+        )
+        self._signed_clock = SignedClock(clock)
+        self._freshness = Freshness(options.poll_seconds, self._time_text)
+        requests = parse_requests(options.formats, options.optional)
+        self._downloads = Downloads(self._folder, self._web, requests)
+        self._manifests = Manifests(
+            options,
+            requests,
+            self._web,
+            self._folder,
+            self._store,
+            clock=self._signed_clock,
+            freshness=self._freshness,
+            log=tell,
+        )
+        self._status = StatusReporter(
+            options.environment,
+            self._robot,
+            self._web,
+            self._stopping,
+            lambda reason: self._tell_once("status", detail=reason),
+        )
+        self._reported: tuple[Any, ...] | None = None
         self._told: set[str] = set()
-        self._preloaded: tuple[int, str, tuple[File, ...]] | None = None
+        self._preloaded: Manifest | None = None
+        self._preloaded_closures = ""
         self._rejoined = False
         self._in_vain = 0
         self._called = 0
         self._behind = 0
+
+    @property
+    def _state(self) -> State:
+        return self._store.value
 
     # --- outside ---
 
     def open(self) -> None:
         """Take the folder and look at what is in it. Raises Conflict or Invalid where it is not ours."""
         self._folder.open()
-        self._state = load(self._folder.state, self.options.environment)
+        self._store.load()
         given = self.options.key
-        if given is not None and given != self._state.given:
-            if self._state.key is not None and given not in (trust.key_id(self._state.key), _text(self._state.key)):
+        state = self._state
+        if given is not None and given != state.given:
+            if state.key is not None and given not in (trust.key_id(state.key), _text(state.key)):
                 self._tell("trusting", key=given, detail="the key that was pinned before is forgotten")
-                self._state = dataclasses.replace(self._state, key=None)
-            self._state = dataclasses.replace(self._state, given=given)
+                state = dataclasses.replace(state, key=None, marks={})
+            state = dataclasses.replace(state, given=given)
         installed = self._folder.manifest(self._folder.standing)
         name = self._folder.standing
         if installed is not None and name is not None and (bad := self._folder.damaged(name, installed)):
             self._tell("damaged", version=installed.version, files=bad[:20])
-            self._state = dataclasses.replace(self._state, etag=None)
+            state = dataclasses.replace(state, etag=None)
+        self._store.stage(state)
+        self._signed_clock.floor = state.newest_time
+        self._activation.protect()
         if installed is not None and name is not None:
             self._folder.refresh(name, installed)
 
@@ -170,14 +161,15 @@ class Agent:
         self._web.interrupt()
 
     def once(self) -> bool:
-        """One sync: whether the folder now holds the channel's map and all hooks were content."""
+        """Sync once: whether the folder now holds the channel's map and all hooks succeeded."""
+        self._retries.keep_only()
         try:
-            return self._sync_and_tell()
+            return self._attempt(self._sync)
         except Stopped:
             return False
 
     def run(self) -> None:
-        """Keep the folder until ``stop``."""
+        """Keep the folder up to date until ``stop``."""
         self._ear = Ear(
             self.options.environment,
             self._robot,
@@ -187,6 +179,7 @@ class Agent:
             config=self.options.zenoh_config,
             login=self._login,
         )
+        self._status.bus = self._ear
         if self._login.user not in (None, self._robot):
             reason = (
                 f"a fleet map server's router lets the user {self._login.user} be seen as the robot of that name alone"
@@ -198,22 +191,38 @@ class Agent:
         woken = False
         while not self._stopping.is_set():
             self._wake.clear()
-            before = (self._state.marks, self._said)
+            before = (self._state.marks, self._status.status)
             pause = self.options.poll_seconds
             try:
                 if not woken or not self._ear.connected:
                     self._find_router()
-                good = self._sync_and_tell()
+                good = self._attempt(self._sync) or self._activation.is_waiting()
                 failures = 0 if good else failures + 1
                 # A server of several hosts may know for a moment less than its events say: look again, ever later.
                 self._behind = self._behind + 1 if good and self._mark < self._called else 0
-                vain = woken and before == (self._state.marks, self._said)
+                vain = woken and before == (self._state.marks, self._status.status)
                 self._in_vain = self._in_vain + 1 if vain else 0
+                if failures or self._behind:
+                    pause = min(pause, FIRST_PAUSE_SECONDS * 2 ** min(20, max(failures, self._behind) - 1))
+                pause *= random.uniform(0.5, 1.5)  # noqa: S311  jitter is no secret
+                if (due := self._retries.next_due) is not None:
+                    pause = min(pause, max(0.0, due - time.monotonic()))
+                woken = self._rest_or_switch(max(self._after, pause))
             except Stopped:
                 break
-            if failures or self._behind:
-                pause = min(pause, FIRST_PAUSE_SECONDS * 2 ** min(20, max(failures, self._behind) - 1))
-            woken = self._rest(max(self._after, pause * random.uniform(0.5, 1.5)))  # noqa: S311  jitter is no secret
+
+    def _rest_or_switch(self, seconds: float) -> bool:
+        """Rest for so long, running ``--before-switch`` now and then if it delays a switch: whether an event came."""
+        end = time.monotonic() + seconds
+        while self._activation.is_waiting():
+            remaining = end - time.monotonic()
+            woken = self._rest(max(0.0, min(BEFORE_SWITCH_SECONDS, remaining)))
+            if woken or self._stopping.is_set() or time.monotonic() >= end:
+                return woken
+            self._attempt(self._switch_pending)
+            if not self._activation.is_waiting():
+                return True  # switched, or refused: sync at once
+        return self._rest(max(0.0, end - time.monotonic()))
 
     # --- what wakes it ---
 
@@ -222,14 +231,12 @@ class Agent:
         end = time.monotonic() + seconds
         while True:
             now = time.monotonic()
-            until = end if self._confirm_at is None else min(end, self._confirm_at)
+            confirm_at = self._status.confirm_at
+            until = end if confirm_at is None else min(end, confirm_at)
             woken = self._wait(max(0.0, until - now))
             if woken or self._stopping.is_set() or time.monotonic() >= end:
                 return woken
-            try:
-                self._send_status()
-            except Stopped:
-                return False
+            self._status.send()
 
     def _wait(self, seconds: float) -> bool:
         """Until something happens, at most so long: whether an event or the router was it."""
@@ -249,29 +256,34 @@ class Agent:
         if event.environment != self.options.environment or not isinstance(event.channel, str | None):
             return
         channel = self._state.channel
-        if event.sequence <= self._mark:
+        if not 0 < event.sequence - self._mark <= trust.MAX_SEQUENCE_AHEAD + 1:
             return
         ours = {self.options.channel} if self.options.channel else {PRODUCTION, channel}
         if event.type == "version.created":
             concerns = channel in (LATEST, None)
+        elif event.type in CLOSURE_EVENTS:
+            concerns = True  # in force on every channel at once
         elif event.type.startswith("overlay."):
-            concerns = False  # what is accepted of them comes as a version
+            concerns = False
         else:
             concerns = event.channel in ours or event.type.startswith("environment.")
         if concerns:
-            if event.type == "channel.moved" or (event.type == "version.created" and channel == LATEST):
-                self._called = event.sequence  # so far the channel that is followed has moved
+            is_move = event.type == "channel.moved" or (event.type == "version.created" and channel == LATEST)
+            if is_move or (event.type in CLOSURE_EVENTS and self._manifests.has_closures):
+                self._called = event.sequence  # so far the manifest of the followed channel has moved
+                self._freshness.announce(event.sequence)
             self._wake.set()
 
     @property
     def _mark(self) -> int:
         """The sequence that the channel is known to have reached."""
-        return self._state.marks.get(self._state.channel or "", (-1, ""))[0]
+        mark = self._state.marks.get(self._state.channel or "")
+        return -1 if mark is None else mark.sequence
 
     def _back(self) -> None:
         self._tell("connected", detail="listening for events over Zenoh")
         self._rejoined = True
-        self._put = self._on_bus = None  # who was away may not know how we are
+        self._status.forget_sent()
         self._wake.set()
 
     def _lost(self, problem: str) -> None:
@@ -305,15 +317,14 @@ class Agent:
 
     # --- one sync ---
 
-    def _sync_and_tell(self) -> bool:
+    def _attempt(self, action: Callable[[], bool]) -> bool:
+        """Run a step and report its errors: whether it succeeded."""
         self._after = 0.0
-        self._target = None
+        self._about = None
         try:
-            good = self._sync()
+            good = action()
         except FleetMapError as error:
-            if isinstance(error, Busy):
-                self._after = error.seconds
-            self._fail("refused" if isinstance(error, Untrusted) else "failed", error.detail)
+            self._report_error(error)
             good = False
         except OSError as error:
             self._fail("failed", f"{error.filename or self._folder.path}: {error.strerror or error}")
@@ -323,31 +334,66 @@ class Agent:
         except Exception as error:  # noqa: BLE001  a mistake of ours; who ends here is of no use to a robot
             where = traceback.extract_tb(error.__traceback__)[-1]
             place = f"{Path(where.filename).name}:{where.lineno}"
-            self._fail("failed", f"the agent made a mistake ({type(error).__name__} at {place}): {error}")
+            self._fail("failed", f"internal error in the agent ({type(error).__name__} at {place}): {error}")
             good = False
-        self._send_status()
+        self._status.send()
         return good
 
     _after = 0.0
+    _about: Manifest | None = None
+    """The map that an error is about; None for the current one."""
 
     def _sync(self) -> bool:
-        self._keep(self._state)
-        plans = self._plans()
+        self._store.keep(self._state)
+        self._write_hooks()
+        try:
+            plans = self._plans()
+        except FleetMapError:
+            if self._activation.is_load_due:  # hooks that were cut off run without a server, too
+                self._report(self._activation.load())
+            raise
         channel = self._channel(plans)
-        manifest = self._manifest(channel)
-        if manifest is not None:
-            self._install(manifest)
-        self._target = None
-        good = self._run_hooks()
-        if good:
-            planned = next((p for p in plans or () if p.get("channel") == channel), {}).get("planned")
-            standing = (self._folder.standing, self._state.marks.get(channel))
-            if planned is None or self._activated != standing:
-                self._say("active")
-                self._activated = standing
-            if plans is not None:
-                self._preload(planned)
-        return good
+        planned = next((p for p in plans or () if p.get("channel") == channel), {}).get("planned")
+        outcome: Outcome | None = None
+        try:
+            outcome = self._follow(channel)
+            if outcome.state == "active" and (problem := self._freshness.stale_problem()) is not None:
+                raise Untrusted(problem)
+            self._report(outcome, is_planned=planned is not None)
+        except FleetMapError as error:
+            if planned is None:
+                raise
+            self._report_error(error, is_planned=True)
+            outcome = Outcome("failed", error.detail)
+        self._about = None
+        if plans is not None:
+            self._preload(planned, outcome)
+        return outcome.state == "active"
+
+    def _write_hooks(self) -> None:
+        try:
+            write_hooks(self._folder, self.options.on_change, self._robot)
+        except OSError as error:  # a full disk stops agent-level, and not the agent
+            self._tell_once("hooks", detail=f"{self._folder.path}/hooks.json cannot be written: {error.strerror}")
+
+    def _follow(self, channel: str) -> Outcome:
+        """Bring ``current`` to the channel's map and have the robot load it."""
+        manifest = self._manifests.latest(channel)
+        outcome = self._install_latest(channel, manifest) if manifest is not None else None
+        self._about = None
+        loaded = self._activation.load()
+        return loaded if outcome is None or outcome.state == "active" else outcome
+
+    def _switch_pending(self) -> bool:
+        """Ask ``--before-switch`` again for the map that waits for it."""
+        pending, self._activation.pending = self._activation.pending, None
+        if pending is None or pending.manifest.expires.timestamp() < self._signed_clock.now():
+            return False
+        outcome = self._switch(pending.name, pending.manifest, pending.members, pending.since)
+        if outcome.state == "active":
+            outcome = self._activation.load()
+        self._report(outcome, is_planned=self._preloaded is not None)
+        return outcome.state == "active"
 
     def _plans(self) -> list[Mapping[str, Any]] | None:
         try:
@@ -368,80 +414,73 @@ class Agent:
         self._tell_once("following", channel=LATEST, detail="no channel production stands on a version yet")
         return LATEST
 
-    def _manifest(self, channel: str, wanted: Callable[[Manifest], bool] = lambda _: True) -> Manifest | None:
-        """The channel's manifest, believed; None where the installed one is still it, or it is not wanted."""
-        asked = f"{channel}?{','.join(self.options.formats)}"
-        state = self._state
-        current = state.asked == asked and state.etag is not None and state.expires > self._clock()
-        installed = self._folder.manifest(self._folder.standing)
-        newest = installed is not None and (installed.sequence, installed.root) == state.marks.get(channel)
-        fits = current and newest  # else "not modified" would be said of a map that does not stand
-        found = self._web.manifest(
-            self.options.environment, channel, self.options.formats, state.etag if fits else None
-        )
-        if found is None:
-            return None
-        manifest, key = self._believe(found[0], found[1], channel, state.marks.get(channel))
-        if not wanted(manifest):
-            return None
-        new = dataclasses.replace(state, key=key).marked(channel, manifest.sequence, manifest.root)
-        if state.key != key:
-            self._tell("trusting", key=trust.key_id(key), detail="rotated" if state.key else "first contact")
-        self._keep(new)
-        self._etag = (asked, found[2], manifest.expires.timestamp())
-        return manifest
+    def _install_latest(self, channel: str, manifest: Manifest) -> Outcome:
+        """Install a manifest, or the one that replaces it if closures change during the download."""
+        for attempt in range(MAX_CLOSURE_CHANGES):
+            try:
+                return self._install(manifest)
+            except (ClosuresChanged, NotFound, Invalid, Untrusted) as error:
+                newer = self._manifests.latest(channel) if manifest.overlays_digest is not None else None
+                if newer is None or (newer.map_key == manifest.map_key and not isinstance(error, ClosuresChanged)):
+                    raise
+                if newer.map_key == manifest.map_key and self._stopping.wait(CLOSURES_SECONDS * 2**attempt):
+                    raise Stopped from None  # the server's manifest is older than its files for a moment
+                manifest = newer
+        return self._install(manifest)
 
-    _etag: tuple[str, str | None, float] = ("", None, 0.0)
-
-    def _believe(
-        self, data: bytes, signature: str, channel: str | None, mark: tuple[int, str] | None
-    ) -> tuple[Manifest, bytes]:
-        key = trust.signer(data, signature, self._state.key, self._state.given, self._web.keys)
-        manifest = trust.parse(data, signature)
-        trust.check(
-            manifest,
-            environment=self.options.environment,
-            channel=channel,
-            formats=self.options.formats,
-            mark=mark,
-            now=datetime.fromtimestamp(self._clock(), timezone.utc),
-        )
-        return manifest, key
-
-    def _install(self, manifest: Manifest) -> None:
-        """Fetch what is not here, build the version, switch to it."""
+    def _install(self, manifest: Manifest) -> Outcome:
+        """Fetch what is missing, build the version, and switch to it."""
         name = self._folder.standing
         installed = self._folder.manifest(name)
         bad = self._folder.damaged(name, installed) if name is not None and installed is not None else []
         if bad and installed is not None:
             self._tell("damaged", version=installed.version, files=bad[:20])
-        whole = installed is not None and not bad
-        if not (whole and installed and (installed.content, installed.root) == (manifest.content, manifest.root)):
-            received, deltas, begun = self._web.received, self._web.deltas, time.monotonic()
-            self._target = (manifest.version, manifest.root)
-            self._say("downloading")
-            sources = self._fetch(manifest, installed)
-            if (newer := self._overtaken(manifest, time.monotonic() - begun)) is not None:
-                self._install(newer)
-                return
-            name = self._folder.build(manifest, sources)
-            self._folder.switch(name)
-            self._tell(
-                "switched",
-                version=manifest.version,
-                root=manifest.root,
-                channel=manifest.channel,
-                sequence=manifest.sequence,
-                files=len(_changed(installed, manifest)),
-                bytes=self._web.received - received,
-                deltas=self._web.deltas - deltas,
-                seconds=round(time.monotonic() - begun, 3),
-            )
-        elif installed.data != manifest.data and name is not None:
-            self._folder.describe(name, manifest)  # the same files: a newer sequence or a later expiry
-        asked, etag, expires = self._etag
-        self._keep(dataclasses.replace(self._state, etag=etag, asked=asked, expires=expires))
-        self._folder.tidy(self._preloaded[2] if self._preloaded else ())
+        if name is not None and installed is not None and not bad and installed.map_key == manifest.map_key:
+            self._activation.pending = None
+            if installed.data != manifest.data:
+                self._folder.describe(name, manifest)  # the same files: a newer sequence or a later expiry
+            self._installed(manifest)
+            return ACTIVE
+        if (refused := self._activation.refusal(manifest)) is not None:
+            return refused
+        self._about = manifest
+        pending = self._activation.pending
+        if pending is not None and pending.manifest.map_key == manifest.map_key:
+            self._folder.describe(pending.name, manifest)
+            return self._switch(pending.name, manifest, pending.members, pending.since)
+        self._activation.pending = None
+        web, begun = self._web, time.monotonic()
+        received, deltas, failed_deltas = web.received, web.deltas, web.failed_deltas
+        ready = self._preloaded.files if self._preloaded else ()
+        sources = self._downloads.fetch(
+            manifest, installed, ready, lambda: self._set_status("downloading", about=manifest)
+        )
+        if (newer := self._overtaken(manifest, time.monotonic() - begun)) is not None:
+            return self._install(newer)
+        members = {
+            "version": manifest.version,
+            "root": manifest.root,
+            "channel": manifest.channel,
+            "sequence": manifest.sequence,
+            "files": len(changed_files(installed, manifest)),
+            "bytes": web.received - received,
+            "deltas": web.deltas - deltas,
+            "seconds": round(time.monotonic() - begun, 3),
+        }
+        if (count := web.failed_deltas - failed_deltas) > 0:
+            members["detail"] = f"{count} deltas could not be decoded: fetched the complete files instead"
+        return self._switch(self._folder.build(manifest, sources), manifest, members, self._time_text()[:19] + "Z")
+
+    def _switch(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
+        outcome = self._activation.switch(name, manifest, members, since)
+        if outcome.state == "active":
+            self._installed(manifest)
+        return outcome
+
+    def _installed(self, manifest: Manifest) -> None:
+        """Note the ETag of the manifest that is now the current one, and remove what is no longer needed."""
+        self._manifests.note_installed(manifest)
+        self._folder.tidy(self._preloaded.files if self._preloaded else ())
 
     def _overtaken(self, manifest: Manifest, seconds: float) -> Manifest | None:
         """The channel's newer manifest, where it moved on while this map was fetched, to one that is here already: what
@@ -449,215 +488,115 @@ class Agent:
         """
         if manifest.channel is None or (self._called <= manifest.sequence and seconds < LONG_SECONDS):
             return None
-        index = self._folder.index()
 
         def here(newer: Manifest) -> bool:
-            if newer.sequence == manifest.sequence:
+            if newer.mark == manifest.mark:
                 return False
             self._wake.set()
-            return all(self._folder.known(file, index) is not None for file in newer.files)
+            return self._downloads.has_all(newer)
 
         try:
-            return self._manifest(manifest.channel, here)
+            return self._manifests.latest(manifest.channel, here)
         except FleetMapError:
             return None  # the next look tells of it
 
-    def _fetch(self, manifest: Manifest, installed: Manifest | None) -> dict[str, Path]:
-        index = self._folder.index()
-        old = {file.path: file for file in installed.files} if installed else {}
-        sources: dict[str, Path] = {}
-        wanted = []
-        for file in manifest.files:
-            there = self._folder.known(file, index)
-            if there is None:
-                wanted.append(file)
-            else:
-                sources[file.path] = there
-        self._folder.make_room(manifest, sources, self._preloaded[2] if self._preloaded else ())
-        for file in wanted:
-            ready = self._folder.ready(file)
-            if not ready.exists():  # two names can have the same bytes
-                before = self._folder.before(file, old)
-                self._web.fetch(manifest.environment, manifest.version, file, ready, before)
-            sources[file.path] = ready
-        return sources
+    def _preload(self, planned: Any, outcome: Outcome) -> None:
+        """Fetch what a channel is planned to move to, so that the switch itself takes no time.
 
-    def _preload(self, planned: Any) -> None:
-        """Fetch what a channel is planned to move to, so that the switch itself takes no time."""
+        outcome: of the map that the channel points to now; a failure is part of the status ``ready``.
+        """
         version = planned.get("version") if isinstance(planned, dict) else None
         if type(version) is not int:
             if self._preloaded is not None:
                 self._preloaded = None
                 self._folder.tidy()
             return
-        if self._preloaded is not None and self._preloaded[0] == version:
-            self._target = self._preloaded[:2]
-            self._say("ready")
-            return
-        found = self._web.manifest(self.options.environment, str(version), self.options.formats)
-        if found is None:
-            return
-        manifest, _ = self._believe(found[0], found[1], None, None)
-        if manifest.version != version:
-            raise Untrusted(f"the manifest is of version {manifest.version}, and {version} was asked for")
-        self._target = (manifest.version, manifest.root)
-        self._fetch(manifest, self._folder.manifest(self._folder.standing))
-        self._preloaded = (manifest.version, manifest.root, manifest.files)
-        self._say("ready")
+        closures = self._manifests.closures_key
+        if self._preloaded is None or (self._preloaded.version, self._preloaded_closures) != (version, closures):
+            manifest = self._manifests.planned(version)
+            self._about = manifest
+            self._downloads.fetch(manifest, self._folder.manifest(self._folder.standing), ())
+            self._preloaded, self._preloaded_closures = manifest, closures
+        self._set_status("ready", None if outcome.state == "active" else outcome.detail, self._preloaded)
 
-    # --- hooks ---
+    # --- status ---
 
-    def _run_hooks(self) -> bool:
-        """Run what is to be run for the version that stands and was not yet: whether all were content."""
-        name = self._folder.standing
-        manifest = self._folder.manifest(name)
-        if name is None or manifest is None or self._state.activated == name:
-            return True
-        before = self._folder.manifest(self._state.activated)
-        if self.options.on_change:  # cut off in the middle, or taken back: what the robot has taken is not known
-            self._keep(dataclasses.replace(self._state, activated=None))
-        variables = {
-            "FLEETMAP_ENVIRONMENT": manifest.environment,
-            "FLEETMAP_VERSION": str(manifest.version),
-            "FLEETMAP_ROOT": manifest.root,
-            "FLEETMAP_CHANNEL": manifest.channel or "",
-            "FLEETMAP_SEQUENCE": str(manifest.sequence),
-            "FLEETMAP_CURRENT": str(self._folder.current),
-            **self._changes(_changed(before, manifest)),
-            "FLEETMAP_LAYERS": " ".join(_changed_layers(before, manifest)),
-            "FLEETMAP_ROBOT": self._robot,
-        }
-        for command in self.options.on_change:
-            problem = hooks.run(command, variables, stopping=self._stopping)
-            if problem is not None:
-                if self._stopping.is_set():
-                    raise Stopped
-                self._fail(
-                    "failed", f"version {manifest.version} is in place, but its robot has not taken it: {problem}"
-                )
-                return False
-            self._tell("hook", command=command, version=manifest.version)
-        self._keep(dataclasses.replace(self._state, activated=name))
+    def _report(self, outcome: Outcome, *, is_planned: bool = False) -> None:
+        """Report what became of the channel's map.
+
+        is_planned: a planned version is reported as well; this status is then sent only if it is new.
+        """
+        what = (outcome.state, outcome.detail, self._folder.standing, self._mark)
+        if is_planned and what == self._reported:
+            return
+        self._reported = what
+        if outcome.state == "active":
+            self._set_status("active", self._remark())
+        elif outcome.state == "failed":
+            if self._set_status("failed", outcome.detail, outcome.manifest):
+                self._tell("failed", detail=outcome.detail)
+        else:
+            self._set_status("ready", outcome.detail, outcome.manifest)
+
+    def _remark(self) -> str | None:
+        """Return what a robot with an active map lacks: optional formats, or news that the bus announced."""
+        current = self._folder.manifest(self._folder.standing)
+        if current is None:
+            return None
+        remarks = (
+            self._manifests.missing_remark(current),
+            self._freshness.behind_remark(self._mark),
+            self._activation.hook_remark(),
+        )
+        return "; ".join(remark for remark in remarks if remark) or None
+
+    def _report_error(self, error: FleetMapError, *, is_planned: bool = False) -> None:
+        if isinstance(error, Busy):
+            self._after = error.seconds
+        what = ("failed", error.detail, self._folder.standing, self._mark)
+        if is_planned and what == self._reported:
+            return
+        self._reported = what
+        self._fail("refused" if isinstance(error, Untrusted) else "failed", error.detail)
+
+    def _set_status(self, state: RobotState, detail: str | None = None, about: Manifest | None = None) -> bool:
+        """Note the status and send it: whether it is new. about: the map that it is about; default: the current one."""
+        current = self._folder.manifest(self._folder.standing)
+        subject = about or current
+        version, root = (subject.version, subject.root) if subject else (0, NO_ROOT)
+        channel = self._state.channel or self.options.channel or LATEST
+        sequence, overlays = (current.sequence, current.overlays_digest) if current else (None, None)
+        detail = detail[: messages.MAX_DETAIL] if detail else None
+        holds = self._loaded(current)
+        status = RobotStatus(channel, version, root, state, detail, self._time_text(), sequence, overlays, holds)
+        if not self._status.set(status):
+            return False
+        if state != "failed":
+            self._tell(state, version=version, root=root, channel=channel, **({"detail": detail} if detail else {}))
+        self._status.send()
         return True
 
-    def _changes(self, paths: Sequence[str]) -> dict[str, str]:
-        """The variables that list changed files. A variable's size is limited (128 KiB on Linux): what does not fit is
-        left out from the deepest folders up, and stands in the file with the rest.
+    def _loaded(self, current: Manifest | None) -> tuple[int, str] | None:
+        """Version and root of the current map if the hooks have loaded it; None while they have not.
+
+        A server that applies no closures does not know this member either.
         """
-        where = self._folder.path / "changed"
-        write_whole(where, "".join(f"{path}\n" for path in paths).encode())
-        room, fit = MAX_VARIABLE_BYTES, set()
-        for path in sorted(paths, key=lambda p: (p.count("/"), p)):
-            room -= len(path.encode()) + 1
-            if room < 0:
-                break
-            fit.add(path)
-        return {"FLEETMAP_CHANGED": "\n".join(p for p in paths if p in fit), "FLEETMAP_CHANGED_FILE": str(where)}
+        if current is None or current.overlays_digest is None:
+            return None
+        return (current.version, current.root) if self._state.activated == self._folder.standing else None
 
-    # --- what is told ---
-
-    def _keep(self, state: State) -> None:
-        """On the disk, too. What could not be written is tried again, before anything else is done."""
-        if state != self._state:
-            self._state, self._unsaved = state, True
-        if self._unsaved:
-            try:
-                save(self._folder.state, state)
-            except OSError as error:
-                if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                    raise
-                self._folder.spare()
-                save(self._folder.state, state)
-            self._unsaved = False
-
-    _unsaved = False
-
-    def _say(self, state: RobotState, detail: str | None = None) -> None:
-        """Note the status and send it. version and root: of what it is about: what stands, unless another
-        is being fetched or lies ready.
-        """
-        manifest = self._folder.manifest(self._folder.standing)
-        version, root = (manifest.version, manifest.root) if manifest else (0, NO_ROOT)
-        if self._target is not None:
-            version, root = self._target
-        channel = self._state.channel or self.options.channel or LATEST
-        sequence = manifest.sequence if manifest else None
+    def _time_text(self) -> str:
         moment = datetime.fromtimestamp(self._clock(), timezone.utc)
-        now = moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        detail = detail[: messages.MAX_DETAIL] if detail else None
-        status = RobotStatus(channel, version, root, state, detail, now, sequence, holds=self._loaded(manifest))
-        if _same(status, self._said):
-            return
-        self._said = status
-        if detail is None:
-            self._tell(state, version=version, root=root, channel=channel)
-        self._send_status()
-
-    def _loaded(self, standing: Manifest | None) -> tuple[int, str] | None:
-        """Version and root that ``current`` points to, if the hooks have loaded it; None while they have not."""
-        if standing is None:
-            return 0, NO_ROOT
-        return (standing.version, standing.root) if self._state.activated == self._folder.standing else None
+        return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
     def _fail(self, what: str, detail: str) -> None:
         self._tell(what, detail=detail)
-        self._say("failed", detail=detail)
-
-    def _send_status(self) -> None:
-        """Over Zenoh at once and over HTTP a little later, or over HTTP at once where nobody is on the bus; once for
-        each change. What could not be sent is sent later.
-
-        A robot that is not on the bus says it again now and then: only so does the server know that it is there.
-        """
-        status, now = self._said, time.monotonic()
-        if status is None or self._stopping.is_set():
-            return
-        on_bus = self._ear is not None and self._ear.connected
-        stale = not on_bus and now - self._put_at > AGAIN_SECONDS
-        if _same(status, self._put) and not stale:
-            self._confirm_at = None
-            return
-        if on_bus and self._ear is not None:
-            if not _same(status, self._on_bus) and self._ear.put_status(status):
-                self._on_bus = status
-            if _same(status, self._on_bus):
-                if self._confirm_at is None:
-                    # A robot counts in roll-outs only once it has reported with its token.
-                    share = random.uniform(0.25, 1.0)  # noqa: S311
-                    self._confirm_at = now + share * (CONFIRM_SECONDS if self._confirmed else FIRST_CONFIRM_SECONDS)
-                if now < self._confirm_at:
-                    return
-        self._confirm_at = now + CONFIRM_SECONDS  # where this try fails
-        try:
-            self._web.put_status(self._robot, {"environment": self.options.environment, **status.as_dict()})
-        except Unavailable:
-            return
-        except FleetMapError as error:
-            self._tell_once("status", detail=f"the server does not take the robot's status: {error.detail}")
-        self._put, self._put_at, self._confirm_at, self._confirmed = status, now, None, True
+        self._set_status("failed", detail, self._about)
 
     def _tell_once(self, what: str, **members: Any) -> None:
         if what not in self._told:
             self._told.add(what)
             self._tell(what, **members)
-
-
-def _same(one: RobotStatus, other: RobotStatus | None) -> bool:
-    return other is not None and dataclasses.replace(one, time=None) == dataclasses.replace(other, time=None)
-
-
-def _changed(old: Manifest | None, new: Manifest) -> list[str]:
-    """Paths of files that are new, gone or other."""
-    before, after = old.content if old else {}, new.content
-    return sorted(path for path in {*before, *after} if before.get(path) != after.get(path))
-
-
-def _changed_layers(old: Manifest | None, new: Manifest) -> list[str]:
-    """Names of the layers that are new, gone or other."""
-    if not new.layers:
-        return list(LAYERS)
-    before, after = old.layers if old else {}, new.layers
-    return sorted(name for name in {*before, *after} if before.get(name) != after.get(name))
 
 
 def _text(key: bytes) -> str:

@@ -3,30 +3,42 @@
 ::
 
     DIR/current -> versions/7-9f3c21aa       switched by one rename: what it names is always whole and verified
-    DIR/versions/7-9f3c21aa/<format>/<file>  with manifest.json, manifest.sig and environment.sh
+    DIR/versions/7-9f3c21aa/<format>/<file>  with manifest.json, manifest.sig, environment.sh, closures.json
+                                             and levels.json
+    DIR/versions/7-9f3c21aa-0b12cd34         the same root with closures of this digest in force
     DIR/partial/<sha256>[.part]              what was fetched, whole or not yet
     DIR/state.json, DIR/lock, DIR/changed    the last: what the hooks were told that changed
+    DIR/hooks.json, DIR/hooks.lock           the hooks, for agent-level; held while they run
+    DIR/hook-status, DIR/level               what the hooks did; the level that the robot is on
 
 Files that did not change are hard links to those of the version before, so they are read-only.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
+import json
 import os
+import re
 import shlex
 import shutil
+import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from app.agent.state import digest, sync_folder, write_new
 from app.agent.trust import File, Manifest, parse
+from app.agent.web import Stopped
 from app.errors import Conflict, Invalid, Unavailable, Untrusted
 
 KEPT = 2
 """Old versions that stay, beside the current one."""
+
+HOOKS_LOCK_SECONDS = 0.1
+"""Interval between two attempts to get the lock for hooks."""
 
 READ_ONLY = 0o444
 CHUNK = 1 << 20
@@ -41,6 +53,9 @@ class Folder:
         self.versions = self.path / "versions"
         self.partial = self.path / "partial"
         self.state = self.path / "state.json"
+        self.hook_status = self.path / "hook-status"
+        self.protected: frozenset[str] = frozenset()
+        """Names of versions that are never removed: they may be switched to again."""
         self._lock: IO[str] | None = None
 
     def open(self) -> None:
@@ -61,6 +76,21 @@ class Folder:
         self._lock = handle
         for left in self.versions.glob(".*"):
             shutil.rmtree(left, ignore_errors=True)
+
+    @contextlib.contextmanager
+    def hooks_lock(self, stopping: threading.Event | None = None) -> Iterator[None]:
+        """Wait until no other process runs hooks of this directory, and hold that. Raises Stopped."""
+        with (self.path / "hooks.lock").open("a") as handle:
+            while True:
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if stopping is None:
+                        time.sleep(HOOKS_LOCK_SECONDS)
+                    elif stopping.wait(HOOKS_LOCK_SECONDS):
+                        raise Stopped from None
+            yield
 
     def close(self) -> None:
         """Give the lock back."""
@@ -158,22 +188,19 @@ class Folder:
         self._describe(self.versions / name, manifest)
 
     def refresh(self, name: str, manifest: Manifest) -> None:
-        """Write ``environment.sh`` anew where the folder was moved, or an older agent wrote it."""
-        where = self.versions / name / "environment.sh"
-        data = environment_sh(manifest, self.current).encode()
-        try:
-            if where.read_bytes() == data:
-                return
-        except FileNotFoundError:
-            pass
-        write_new(where, data)
+        """Write what describes a version again if the directory was moved, or an older agent wrote it."""
+        for path, data in self._descriptions(self.versions / name, manifest):
+            if not path.exists() or path.read_bytes() != data:
+                write_new(path, data)
 
     def build(self, manifest: Manifest, sources: dict[str, Path]) -> str:
         """A version's folder, whole and on the disk, not yet current: its name. sources: path -> verified file."""
         base = f"{manifest.version}-{manifest.root[:8]}"
+        if manifest.closures_key:
+            base += f"-{manifest.closures_key[:8]}"
         for name in (n for n in self._names() if n == base or n.startswith(base + ".")):
             there = self.manifest(name)
-            if there is not None and there.content == manifest.content and not self.damaged(name, there):
+            if there is not None and there.map_key == manifest.map_key and not self.damaged(name, there):
                 self.describe(name, manifest)
                 return name
         staging = self.versions / ".new"
@@ -230,7 +257,9 @@ class Folder:
     def _drop(self, kept: int, needed: Iterable[Path] = ()) -> None:
         """Remove versions beside the current one but so many, the last used ones, and those of needed files."""
         spared = {self.standing} | {p.relative_to(self.versions).parts[0] for p in needed if self.versions in p.parents}
-        for name in [n for n in self._names() if n not in spared][kept:]:
+        old = [name for name in self._names() if name not in spared]
+        removable = [name for name in old if name not in self.protected]
+        for name in removable[max(0, kept - len(old) + len(removable)) :]:
             gone = self.versions / f".{name}"
             shutil.rmtree(gone, ignore_errors=True)
             (self.versions / name).rename(gone)
@@ -249,13 +278,19 @@ class Folder:
         return [p.name for p in sorted(found, key=lambda p: (-p.stat().st_mtime, p.name))]
 
     def _describe(self, where: Path, manifest: Manifest) -> None:
-        """The manifest and environment.sh in a version's folder."""
-        for name, data in (
-            ("manifest.sig", manifest.signature.encode() + b"\n"),
-            ("environment.sh", environment_sh(manifest, self.current).encode()),
-            ("manifest.json", manifest.data),
-        ):
-            write_new(where / name, data)
+        """Write the manifest, and what follows from it, into a version's folder."""
+        write_new(where / "manifest.sig", manifest.signature.encode() + b"\n")
+        for path, data in self._descriptions(where, manifest):
+            write_new(path, data)
+        write_new(where / "manifest.json", manifest.data)
+
+    def _descriptions(self, where: Path, manifest: Manifest) -> list[tuple[Path, bytes]]:
+        """Return the files that describe a version to others than the agent."""
+        return [
+            (where / "environment.sh", environment_sh(manifest, self.current).encode()),
+            (where / "closures.json", closures_json(manifest)),
+            (where / "levels.json", levels_json(manifest)),
+        ]
 
 
 def _holds(path: Path, file: File) -> bool:
@@ -319,14 +354,52 @@ def environment_sh(manifest: Manifest, current: Path) -> str:
         values[variable] = str(current / found) if found else ""
     place = {**dict.fromkeys(PLACE, ""), **manifest.variables}
     values |= {name: value for name, value in place.items() if name not in (*values, "GAZEBO_MODEL_PATH")}
+    values |= _level_variables(manifest, current)
     values |= {
         "FLEETMAP_ENVIRONMENT": manifest.environment,
         "FLEETMAP_VERSION": str(manifest.version),
         "FLEETMAP_ROOT": manifest.root,
         "FLEETMAP_CHANNEL": manifest.channel or "",
         "FLEETMAP_CURRENT": str(current),
+        "FLEETMAP_OVERLAYS": manifest.overlays_digest or "",
+        "FLEETMAP_CLOSURES_FILE": str(current / "closures.json"),
+        "FLEETMAP_LEVELS_FILE": str(current / "levels.json"),
     }
     lines = [f"export {name}={shlex.quote(value)}" for name, value in values.items()]
     if models:
         lines.append('export GAZEBO_MODEL_PATH="${GAZEBO_MODEL_PATH:+$GAZEBO_MODEL_PATH:}$GAZEBO_CUSTOM_MODELS"')
     return "# Written by `fleetmap agent` with each version; to be sourced.\n" + "\n".join(lines) + "\n"
+
+
+def _level_variables(manifest: Manifest, current: Path) -> dict[str, str]:
+    """Return the template's variables for each level with files of its own, as ``COSTMAP_YAML_FILE_L2``."""
+    values: dict[str, str] = {}
+    for level in manifest.levels:
+        suffix = re.sub(r"[^A-Z0-9]", "_", level.name.upper())
+        names = {(f.format, f.name.rpartition("/")[2]): f.path for f in manifest.files if f.level == level.name}
+        for variable, format_, wanted in TEMPLATE:
+            path = next((names[format_, name] for name in wanted if (format_, name) in names), None)
+            if path is not None:
+                values.setdefault(f"{variable}_{suffix}", str(current / path))
+    return values
+
+
+def closures_json(manifest: Manifest) -> bytes:
+    """Return ``closures.json``: the closures in force, as the signed manifest lists them."""
+    return _json({"digest": manifest.overlays_digest or "", "closures": list(manifest.overlays)})
+
+
+def levels_json(manifest: Manifest) -> bytes:
+    """Return ``levels.json``: name, elevation and files (by format, relative to its folder) of each level."""
+    levels = []
+    for level in manifest.levels:
+        files: dict[str, list[str]] = {}
+        for file in manifest.files:
+            if file.level == level.name:
+                files.setdefault(file.format, []).append(file.name)
+        levels.append({"name": level.name, "elevation": level.elevation, "files": files})
+    return _json({"levels": levels})
+
+
+def _json(body: Mapping[str, Any]) -> bytes:
+    return json.dumps(body, ensure_ascii=False, indent=1).encode() + b"\n"

@@ -7,58 +7,85 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import errno
 import hashlib
 import json
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from app.errors import Invalid
 
-FORM = 1
 HASH_BYTES = 1 << 18
+
+FORM = 2
+"""Format of state.json. Form 1, of releases without epochs, is read as well."""
+
+
+class Mark(NamedTuple):
+    """Position of a manifest in its channel's history."""
+
+    epoch: int
+    sequence: int
+    root: str
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """marks: channel -> (sequence, root) of the newest manifest ever believed. etag, expires (seconds since 1970) and
-    asked (channel and formats) are of the manifest that is installed. activated: the folder for which the hooks have
-    run; None while they do.
+    """Persistent state.
+
+    Attributes:
+        marks: highest (epoch, sequence, root) accepted per channel; lower ones are refused.
+        etag, expires, asked: of the installed manifest: ETag, expiry in seconds since 1970, channel and formats.
+        activated: version folder for which the hooks have run; None while they run.
+        working: version folder whose hooks succeeded last; ``current`` goes back to it if those of a newer one fail.
+        newest_time: newest signed time accepted, in seconds since 1970.
     """
 
     environment: str
     key: bytes | None = None
     given: str | None = None
     channel: str | None = None
-    marks: Mapping[str, tuple[int, str]] = field(default_factory=dict)
+    marks: Mapping[str, Mark] = field(default_factory=dict)
     etag: str | None = None
     expires: float = 0.0
     asked: str = ""
     activated: str | None = None
+    working: str | None = None
+    newest_time: float = 0.0
 
-    def marked(self, channel: str, sequence: int, root: str) -> State:
-        """After a manifest of this channel was believed."""
-        return dataclasses.replace(self, marks={**self.marks, channel: (sequence, root)}, channel=channel)
+    def marked(self, channel: str, mark: Mark) -> State:
+        """Return the state after a manifest of this channel was accepted."""
+        return dataclasses.replace(self, marks={**self.marks, channel: mark}, channel=channel)
 
 
 def load(path: Path, environment: str) -> State:
     """What stands there, or a fresh one; Invalid where it is of another environment or not to be read."""
     try:
         body = json.loads(path.read_bytes())
-        if body["form"] != FORM:
-            raise ValueError(f"it has the form {body['form']}")
+        if body["form"] not in (1, FORM):
+            raise ValueError(f"it has the form {body['form']}, and this agent reads forms 1 and {FORM}")
         found = State(
             environment=str(body["environment"]),
             key=base64.b64decode(body["key"]) if body.get("key") else None,
             given=body.get("given"),
             channel=body.get("channel"),
-            marks={str(c): (int(m["sequence"]), str(m["root"])) for c, m in body["marks"].items()},
+            marks={
+                str(c): Mark(int(m.get("epoch", 0)), int(m["sequence"]), str(m["root"]))
+                for c, m in body["marks"].items()
+            },
             etag=body.get("etag"),
             expires=float(body.get("expires", 0)),
             asked=str(body.get("asked", "")),
-            activated=body.get("activated"),
+            activated=_name(body.get("activated")),
+            working=_name(body["working"] if "working" in body else body.get("activated")),
+            newest_time=float(body.get("newest_time", 0)),
         )
+        if not math.isfinite(found.newest_time):
+            raise ValueError("newest_time is not a finite number")
     except FileNotFoundError:
         return State(environment)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
@@ -78,13 +105,58 @@ def save(path: Path, state: State) -> None:
         "key": base64.b64encode(state.key).decode() if state.key else None,
         "given": state.given,
         "channel": state.channel,
-        "marks": {c: {"sequence": s, "root": r} for c, (s, r) in sorted(state.marks.items())},
+        "marks": {c: mark._asdict() for c, mark in sorted(state.marks.items())},
         "etag": state.etag,
         "expires": state.expires,
         "asked": state.asked,
         "activated": state.activated,
+        "working": state.working,
+        "newest_time": state.newest_time,
     }
     write_whole(path, json.dumps(body, indent=1).encode() + b"\n")
+
+
+def _name(value: Any) -> str | None:
+    """Check the name of a version folder."""
+    if value is not None and (not isinstance(value, str) or "/" in value or value in ("", ".", "..")):
+        raise ValueError(f"{value!r:.80} does not name a version folder")
+    return value
+
+
+class StateStore:
+    """The state in memory and on the disk. A change that could not be written is written with the next one."""
+
+    def __init__(self, path: Path, environment: str, free_space: Callable[[], None]) -> None:
+        """Create a store. free_space: called if the disk is full, before the state is written once more."""
+        self._path, self._free_space = path, free_space
+        self.value = State(environment)
+        self._unsaved = False
+
+    def load(self) -> None:
+        """Read the state from the disk. Raises Invalid."""
+        self.value = load(self._path, self.value.environment)
+
+    def stage(self, state: State) -> None:
+        """Replace the state; it is saved with the next call of ``keep``."""
+        if state != self.value:
+            self.value, self._unsaved = state, True
+
+    def set(self, **changes: Any) -> None:
+        """Replace some attributes and save."""
+        self.keep(dataclasses.replace(self.value, **changes))
+
+    def keep(self, state: State) -> None:
+        """Save a state if it is new, or if the last one could not be saved."""
+        self.stage(state)
+        if self._unsaved:
+            try:
+                save(self._path, state)
+            except OSError as error:
+                if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                    raise
+                self._free_space()
+                save(self._path, state)
+            self._unsaved = False
 
 
 def write_whole(path: Path, data: bytes) -> None:

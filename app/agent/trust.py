@@ -11,6 +11,7 @@ import base64
 import binascii
 import hashlib
 import json
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,10 +21,19 @@ from typing import Any
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
+from app.agent.state import Mark
 from app.errors import Untrusted
 
 CLOCKS_DIFFER = timedelta(seconds=60)
 """How far a robot's clock may be from the server's."""
+
+MAX_SEQUENCE_AHEAD = 10**9
+"""Maximum distance of a manifest's sequence from the highest accepted one: a stolen key cannot make all later ones look
+old with a single manifest.
+"""
+
+MAX_EPOCH_AHEAD = 2**32
+"""The same for epochs, with room for those that are a time in seconds."""
 
 MAX_FILES = 100_000
 MAX_VARIABLES = 2000
@@ -45,12 +55,13 @@ _FORBIDDEN = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class File:
-    """A file of a map. name: relative, with ``/`` between folders."""
+    """A file of a map. name: relative, with ``/`` between folders. level: name of the level that it belongs to."""
 
     format: str
     name: str
     size: int
     sha256: str
+    level: str | None = None
 
     @property
     def path(self) -> str:
@@ -59,11 +70,20 @@ class File:
 
 
 @dataclass(frozen=True, slots=True)
+class Level:
+    """A storey. elevation: metres."""
+
+    name: str
+    elevation: float
+
+
+@dataclass(frozen=True, slots=True)
 class Manifest:
     """A signed list of a version's files. data, signature: the signed bytes and the header, as they came.
 
     variables: what the place is called (``FARM_NAME`` …), for who sources ``environment.sh``. layers: layer -> a hash
-    of its content.
+    of its content. time: when it was signed. levels: lowest first. missing: optional format -> why it cannot be given.
+    overlays: closures in force, as the server lists them; overlays_digest is None if the server applies none.
     """
 
     environment: str
@@ -77,6 +97,27 @@ class Manifest:
     signature: str
     variables: Mapping[str, str] = field(default_factory=dict)
     layers: Mapping[str, str] = field(default_factory=dict)
+    epoch: int = 0
+    time: datetime | None = None
+    levels: tuple[Level, ...] = ()
+    missing: Mapping[str, str] = field(default_factory=dict)
+    overlays: tuple[Mapping[str, Any], ...] = ()
+    overlays_digest: str | None = None
+
+    @property
+    def mark(self) -> Mark:
+        """Its position in the channel's history."""
+        return Mark(self.epoch, self.sequence, self.root)
+
+    @property
+    def map_key(self) -> tuple[Any, ...]:
+        """Equal for manifests whose version folders are the same."""
+        return self.root, self.closures_key, self.content
+
+    @property
+    def closures_key(self) -> str:
+        """The digest of the closures in force, empty if there are none."""
+        return self.overlays_digest if self.overlays and self.overlays_digest else ""
 
     @property
     def content(self) -> dict[str, str]:
@@ -88,7 +129,8 @@ def parse(data: bytes, signature: str) -> Manifest:
     """The members of a manifest, each checked; Untrusted where they are not what a manifest has."""
     try:
         body = json.loads(data)
-        files = tuple(File(f["format"], f["name"], f["size"], f["sha256"]) for f in body["files"])
+        files = tuple(File(f["format"], f["name"], f["size"], f["sha256"], f.get("level")) for f in body["files"])
+        signed_at = body.get("time")
         expires = read_time(body["expires"])
         found = Manifest(
             body["environment"],
@@ -102,16 +144,26 @@ def parse(data: bytes, signature: str) -> Manifest:
             signature,
             dict(body.get("variables", {})),
             dict(body.get("layers", {})),
+            body.get("epoch", 0),
+            None if signed_at is None else read_time(signed_at),
+            tuple(Level(level["name"], level["elevation"]) for level in body.get("levels", [])),
+            {line["format"]: line["detail"] for line in body.get("missing", [])},
+            tuple(body.get("overlays", [])),
+            body.get("overlays_digest"),
         )
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise Untrusted(f"the server's manifest cannot be read: {type(error).__name__}: {error}") from None
-    whole = all(type(n) is int and 0 <= n < 2**63 for n in (found.sequence, found.version, *(f.size for f in files)))
+    whole = all(
+        type(n) is int and 0 <= n < 2**63
+        for n in (found.sequence, found.version, found.epoch, *(f.size for f in files))
+    )
     texts = all(isinstance(t, str) for t in (found.environment, found.channel or "", found.root))
     hashes = texts and all(isinstance(h, str) and _HASH.fullmatch(h) for h in (found.root, *(f.sha256 for f in files)))
     if not (whole and hashes) or expires.tzinfo is None or len(files) > MAX_FILES:
         raise Untrusted("the server's manifest cannot be read: a number, a hash or the time of expiry is none")
     _check_paths(files)
     _check_variables(found.variables)
+    _check_site(found)
     if not all(isinstance(t, str) for t in found.layers.values()) or not all(map(_LAYER.fullmatch, found.layers)):
         raise Untrusted("the server's manifest cannot be read: a layer's name or hash is none")
     return found
@@ -128,6 +180,41 @@ def read_time(text: str) -> datetime:
     fraction = f".{(found['fraction'] + '000000')[:6]}" if found["fraction"] else ""
     zone = "+00:00" if found["zone"] in ("Z", "z") else found["zone"]
     return datetime.fromisoformat(f"{found['date']}T{found['clock']}{fraction}{zone}")
+
+
+def _check_site(manifest: Manifest) -> None:
+    """Check levels, missing formats, closures and the time of signing."""
+    names = [level.name for level in manifest.levels]
+    problems = (
+        (manifest.time is not None and manifest.time.tzinfo is None, "the time of signing has no zone"),
+        (not all(map(_is_name, names)) or len(set(names)) != len(names), "a level's name is invalid or a duplicate"),
+        (not all(_is_number(level.elevation) for level in manifest.levels), "a level's elevation is not a number"),
+        (not all(f.level is None or f.level in names for f in manifest.files), "a file belongs to an unknown level"),
+        (not all(_is_name(format_) for format_ in manifest.missing), "a missing format has no name"),
+        (not all(isinstance(why, str) for why in manifest.missing.values()), "a missing format has no reason"),
+        (not all(_is_closure(closure) for closure in manifest.overlays), "a closure has no id"),
+        (bool(manifest.overlays) and manifest.overlays_digest is None, "its closures have no digest"),
+        (not _is_digest(manifest.overlays_digest), "the digest of its closures is invalid"),
+    )
+    for is_wrong, problem in problems:
+        if is_wrong:
+            raise Untrusted(f"the server's manifest cannot be read: {problem}")
+
+
+def _is_name(value: object) -> bool:
+    return isinstance(value, str) and value.isprintable() and 0 < len(value.encode("utf-8", "replace")) <= 255
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_closure(value: object) -> bool:
+    return isinstance(value, dict) and _is_name(value.get("id"))
+
+
+def _is_digest(value: object) -> bool:
+    return value is None or (isinstance(value, str) and _HASH.fullmatch(value) is not None)
 
 
 def _check_variables(variables: Mapping[str, str]) -> None:
@@ -232,10 +319,11 @@ def check(
     environment: str,
     channel: str | None,
     formats: Sequence[str],
-    mark: tuple[int, str] | None,
+    optional: Sequence[str] = (),
+    mark: Mark | None,
     now: datetime | None = None,
 ) -> None:
-    """Whether a signed manifest is the one that was asked for. mark: sequence and root of the newest one ever believed.
+    """Whether a signed manifest is the one that was asked for. mark: that of the newest one ever believed.
 
     Raises Untrusted, with what an operator can do.
     """
@@ -245,25 +333,45 @@ def check(
         raise Untrusted(f"the manifest is of the channel {manifest.channel!r}, not of {channel!r}")
     if manifest.expires < (now or datetime.now(timezone.utc)) - CLOCKS_DIFFER:
         raise Untrusted(
-            f"the manifest has expired at {manifest.expires:%Y-%m-%d %H:%M:%S} UTC: somebody hands out an old one, or "
-            "a clock is wrong"
+            f"the manifest has expired at {manifest.expires:%Y-%m-%d %H:%M:%S} UTC, and it is "
+            f"{now or datetime.now(timezone.utc):%Y-%m-%d %H:%M:%S} by the newer of this robot's clock and the newest "
+            "signed time: possible replay of an old one. Check both clocks"
         )
     got = {file.format for file in manifest.files}
-    if got != set(formats):
-        missing, more = sorted(set(formats) - got), sorted(got - set(formats))
+    for format_, why in manifest.missing.items():
+        if format_ in formats:
+            raise Untrusted(f"the server cannot give the required format {format_}: {why}")
+    if not set(formats) <= got <= {*formats, *optional}:
+        missing, more = sorted(set(formats) - got), sorted(got - set(formats) - set(optional))
         raise Untrusted(f"the manifest is of other formats: without {missing or 'none'}, with {more or 'no'} further")
+    _check_ahead(manifest, mark)
     if mark is None:
         return
-    if manifest.sequence < mark[0]:
+    if (manifest.epoch, manifest.sequence) < (mark.epoch, mark.sequence):
+        epoch = f" of epoch {manifest.epoch}" if manifest.epoch != mark.epoch else ""
         raise Untrusted(
-            f"the manifest has the sequence {manifest.sequence}, and {mark[0]} was seen already: somebody hands out an "
-            "old map. If the server was set up anew, remove state.json"
+            f"manifest sequence {manifest.sequence}{epoch} is lower than {mark.sequence}, which this robot has already "
+            "accepted: possible rollback. If the server was set up anew, remove state.json"
         )
-    if manifest.sequence == mark[0] and manifest.root != mark[1]:
+    if (manifest.epoch, manifest.sequence) == (mark.epoch, mark.sequence) and manifest.root != mark.root:
         raise Untrusted(
-            f"the manifest of sequence {manifest.sequence} has the root {manifest.root[:8]}, and {mark[1][:8]} was "
+            f"the manifest of sequence {manifest.sequence} has the root {manifest.root[:8]}, and {mark.root[:8]} was "
             "seen under the same number: there are two servers with one key. If it was restored, remove state.json"
         )
+
+
+def _check_ahead(manifest: Manifest, mark: Mark | None) -> None:
+    """Refuse a position that is too far ahead of the last accepted one."""
+    epoch, sequence = (mark.epoch, mark.sequence) if mark is not None else (0, 0)
+    for name, value, accepted, limit in (
+        ("sequence", manifest.sequence, sequence, MAX_SEQUENCE_AHEAD),
+        ("epoch", manifest.epoch, epoch, MAX_EPOCH_AHEAD),
+    ):
+        if value > accepted + limit:
+            raise Untrusted(
+                f"manifest {name} {value} is more than {limit} ahead of {accepted}, the last one that this robot has "
+                "accepted: rotate the server's key if it may be stolen"
+            )
 
 
 def _verifies(public: bytes, signature: bytes, data: bytes) -> bool:

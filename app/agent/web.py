@@ -30,6 +30,9 @@ else:
 
 API = "/api/v1"
 SIGNATURE = "fleetmap-signature"
+OVERLAYS = "fleetmap-overlays"
+"""Header of a map: digest of the closures that were applied to it."""
+
 TIMEOUT = httpx.Timeout(10.0, read=60.0)
 """Seconds. A map that takes its server longer is answered with a job."""
 
@@ -40,8 +43,11 @@ WATCH_SECONDS = 0.5
 WHOLE_SECONDS = 300.0
 """Until a manifest or another small answer has come."""
 
-PACE_SECONDS, PACE_BYTES = 60.0, 4096
-"""A file's bytes come at least so fast, else its server is as good as away. What came is gone on from."""
+PACE_SECONDS = 60.0
+MIN_BYTES_PER_SECOND = 4096
+"""Minimum pace of a response, averaged over each PACE_SECONDS and over the whole. A slower one counts as failed; the
+next attempt continues with what came.
+"""
 
 MAX_MANIFEST_BYTES = 32 * 2**20
 MAX_JSON_BYTES = 4 * 2**20
@@ -62,6 +68,14 @@ MAX_JOBS = 1000
 
 class Stopped(Exception):
     """The agent was told to end."""
+
+
+class ClosuresChanged(Unavailable):
+    """A file belongs to other closures than its manifest: the manifest is to be fetched again."""
+
+
+class UnreadableDelta(Untrusted):
+    """A delta that does not give a file: the complete file is to be fetched."""
 
 
 class Busy(Unavailable):
@@ -126,8 +140,10 @@ class Web:
         )
         self._stopping = stopping
         self._sockets: list[socket.socket] = []
+        self._overlays: str | None = None
         self.received = 0
         self.deltas = 0
+        self.failed_deltas = 0
 
     def _trust(self, ca: Path | None) -> ssl.SSLContext | bool:
         if ca is not None:
@@ -164,13 +180,13 @@ class Web:
         return [line for line in found if isinstance(line, dict)]
 
     def manifest(
-        self, environment: str, ref: str, formats: Iterable[str], etag: str | None = None
+        self, environment: str, ref: str, query: str, etag: str | None = None
     ) -> tuple[bytes, str, str | None] | None:
-        """The signed bytes, the signature, the ETag; None where it is still the one with ``etag``."""
-        asked = ",".join(quote(name, safe="") for name in formats)
-        path = (
-            f"{API}/environments/{quote(environment, safe='')}/versions/{quote(ref, safe='')}/manifest?formats={asked}"
-        )
+        """The signed bytes, the signature, the ETag; None where it is still the one with ``etag``.
+
+        query: the encoded parameters of the address.
+        """
+        path = f"{API}/environments/{quote(environment, safe='')}/versions/{quote(ref, safe='')}/manifest?{query}"
         headers = {"If-None-Match": etag} if etag else {}
         for _ in range(MAX_JOBS):
             with self._stream(path, headers) as answer:
@@ -192,25 +208,50 @@ class Web:
             if answer.status_code >= 300:
                 raise self._refused(answer)
 
-    def fetch(self, environment: str, version: int, file: File, target: Path, old: tuple[Path, str] | None) -> None:
+    def fetch(
+        self,
+        environment: str,
+        version: int,
+        file: File,
+        target: Path,
+        old: tuple[Path, str] | None,
+        *,
+        query: str = "",
+        overlays: str | None = None,
+    ) -> None:
         """A file into ``target``, whole and verified. What a break leaves in ``<target>.part`` is gone on from.
 
-        old: a file that is here, with its SHA-256, that the server may answer with the difference to. Untrusted where
-        the bytes are not those of the manifest.
+        Args:
+            old: a file that is here, with its SHA-256, that the server may answer with the difference to.
+            query: encoded parameters of the address.
+            overlays: digest of the closures in the manifest.
+
+        Raises:
+            ClosuresChanged: the bytes differ because the closures have changed since.
+            Untrusted: the bytes differ from the manifest.
         """
         path = f"{API}/environments/{quote(environment, safe='')}/versions/{version}/maps/"
-        path += f"{quote(file.format, safe='')}/{quote(file.name, safe='/')}"
+        path += f"{quote(file.format, safe='')}/{quote(file.name, safe='/')}{'?' if query else ''}{query}"
         part = target.with_name(target.name + ".part")
+        self._overlays = None
         for _ in range(2):
             fresh = not part.exists()
             if part.exists() and part.stat().st_size > file.size:
                 part.unlink()
-            whole = self._receive(path, part, file, old if fresh else None)
+            try:
+                whole = self._receive(path, part, file, old if fresh else None)
+            except UnreadableDelta:
+                self.failed_deltas += 1
+                part.unlink(missing_ok=True)
+                old = None
+                continue
             if _complete(part, file):
                 part.chmod(0o444)
                 part.replace(target)
                 return
             part.unlink(missing_ok=True)
+            if overlays is not None and self._overlays not in (None, overlays):
+                raise ClosuresChanged(f"{file.path} has other closures than the manifest")
             if fresh and whole:
                 break
             old = None  # a delta, or a part of before, that did not fit: once more from the start
@@ -228,6 +269,7 @@ class Web:
             dictionary = base64.b64encode(bytes.fromhex(old[1])).decode()
             headers |= {"Available-Dictionary": f":{dictionary}:", "Accept-Encoding": "dcz"}
         with self._stream(path, headers) as answer:
+            self._overlays = answer.headers.get(OVERLAYS)
             if answer.status_code == 416:
                 return False
             if answer.status_code == 202:
@@ -269,16 +311,21 @@ class Web:
 
     def _chunks(self, answer: httpx.Response) -> Iterator[bytes]:
         """What came, as it came: larger pieces would be lost where the line breaks before they are full."""
-        begun, since = time.monotonic(), 0
+        begun = window = time.monotonic()
+        total = since = 0
         for chunk in answer.iter_raw():
             if self._stopping.is_set():
                 raise Stopped
             self.received += len(chunk)
-            since += len(chunk)
-            if time.monotonic() - begun > PACE_SECONDS:
-                if since < PACE_BYTES:
-                    raise Unavailable(f"{self.server} has sent {since} bytes in {PACE_SECONDS:g} seconds")
-                begun, since = time.monotonic(), 0
+            total, since, now = total + len(chunk), since + len(chunk), time.monotonic()
+            if now - window > PACE_SECONDS:
+                for count, seconds in ((since, now - window), (total, now - begun)):
+                    if count < MIN_BYTES_PER_SECOND * seconds:
+                        raise Unavailable(
+                            f"{self.server} has sent {count} bytes in {seconds:.0f} seconds, less than "
+                            f"{MIN_BYTES_PER_SECOND} a second: the download goes on later"
+                        )
+                window, since = now, 0
             yield chunk
 
     def _whole(self, answer: httpx.Response, limit: int) -> bytes:
@@ -405,7 +452,7 @@ def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: File) -> Iterato
         if len(head) >= len(want):
             break
     if head[: len(want)] != want:
-        raise Untrusted(f"{file.path}: the delta is not one to the file that is here")
+        raise UnreadableDelta(f"{file.path}: the delta is not one to the file that is here")
     decoder = zstd.ZstdDecompressor(
         zstd.ZstdDict(where.read_bytes(), is_raw=True).as_prefix,
         options={zstd.DecompressionParameter.window_log_max: WINDOW_LOG},
@@ -417,9 +464,9 @@ def _undo(chunks: Iterator[bytes], old: tuple[Path, str], file: File) -> Iterato
             out = decoder.decompress(data, max_length=1 << 20)
             made += len(out)
             if made > file.size:
-                raise Untrusted(f"{file.path}: the delta unfolds to more bytes than the manifest says")
+                raise UnreadableDelta(f"{file.path}: the delta unfolds to more bytes than the manifest says")
             if out:
                 yield out
             data = b"" if not decoder.needs_input else next(chunks, None)
     except zstd.ZstdError as error:
-        raise Untrusted(f"{file.path}: the delta cannot be read: {error}") from None
+        raise UnreadableDelta(f"{file.path}: the delta cannot be read: {error}") from None

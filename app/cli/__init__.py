@@ -102,6 +102,7 @@ def build(*, all_flags: bool = True) -> typer.Typer:
         ("generate", generate.generate),
         ("template", templates.template),
         ("agent", agent.agent),
+        ("agent-level", agent.agent_level),
         ("migrate", serving.migrate),
         ("demo", serving.demo),
     ):

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+from collections.abc import Callable
 from datetime import datetime, timezone
 from pathlib import Path
 from types import FrameType
@@ -28,8 +29,18 @@ def _copy_ros_package(workspace: Path | None) -> None:
 
 def agent(
     environment: Annotated[str, typer.Option("--environment", "-e", help="Name of the environment.")],
-    formats: Annotated[str, typer.Option("--formats", "-f", help="Formats to keep, separated by commas.")],
+    formats: Annotated[
+        str,
+        typer.Option(
+            "--formats",
+            "-f",
+            help="Required formats, comma-separated, with their parameters: `occupancy_grid?level=L2&grid=map,tmap2`.",
+        ),
+    ],
     into: Annotated[Path, typer.Option("--into", "-o", help="Folder; the maps are in its `current/<format>/`.")],
+    optional: Annotated[
+        str, typer.Option("--optional", help="Formats to keep if the server can give them, comma-separated.")
+    ] = "",
     channel: Annotated[
         str | None, typer.Option("--channel", help="Channel to follow [default: production if it exists, else latest].")
     ] = None,
@@ -39,6 +50,14 @@ def agent(
     on_change: Annotated[
         list[str] | None,
         typer.Option("--on-change", help="Command to run after a change, or `nav2`, `topological`; repeatable."),
+    ] = None,
+    before_switch: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--before-switch",
+            help="Command to run when a new map is ready: exit status 0 switches, 75 asks again in some seconds, any "
+            "other refuses the map; repeatable.",
+        ),
     ] = None,
     key: Annotated[
         str | None,
@@ -107,37 +126,27 @@ def agent(
     FLEETMAP_ZENOH_PASSWORD.
     """
     from app.agent.core import Agent, Options, robot_name
+    from app.agent.requests import parse_formats
     from app.cli.client import DEFAULT_SERVER
     from app.errors import Invalid
     from app.events.login import Login
 
-    names = tuple(dict.fromkeys(part.strip() for part in formats.split(",") if part.strip()))
+    names = parse_formats(formats)
     if not names:
         raise Invalid("--formats needs one format or several, separated by commas: occupancy_grid,tmap2")
 
-    def tell(what: str, **members: Any) -> None:
-        # A log on a full disk, or nobody who reads (where rich would exit): the map is kept all the same.
-        with contextlib.suppress(OSError, SystemExit):
-            print_line(what, members)
-
-    def print_line(what: str, members: dict[str, Any]) -> None:
-        if as_json:
-            time = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-            sys.stdout.write(json.dumps({"time": time, "event": what, **members}, ensure_ascii=False) + "\n")
-            sys.stdout.flush()
-        else:
-            style = "red" if what in ("failed", "refused", "damaged") else None
-            output.say(f"{what}: {_line(members)}", style=style)
-
+    tell = _logger(as_json=as_json)
     agent = Agent(
         Options(
             server=server or DEFAULT_SERVER,
             environment=environment,
             formats=names,
+            optional=parse_formats(optional),
             into=into,
             channel=channel,
             robot=robot_name(robot),
             on_change=tuple(on_change or ()),
+            before_switch=tuple(before_switch or ()),
             token=token or None,
             key=key or None,
             poll_seconds=poll,
@@ -176,6 +185,42 @@ def agent(
             sys.stdout.flush()
             sys.stderr.flush()
         os._exit(0)
+
+
+def agent_level(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory of the agent (`--into`).")],
+    level: Annotated[str, typer.Argument(help="Level that the robot is on now, as in `current/levels.json`.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for all that happens.")] = False,
+) -> None:
+    """Load another level of the robot's map, after it has left a lift.
+
+    Runs the `--on-change` commands of the agent for that level and remembers the level for later maps. The agent may
+    run meanwhile.
+    """
+    from app.agent.activation import hook_variables
+    from app.agent.levels import load_level
+
+    load_level(directory, level, hook_variables, _logger(as_json=as_json))
+
+
+def _logger(*, as_json: bool) -> Callable[..., None]:
+    """Return a function that prints one line for each event."""
+
+    def log(event: str, **members: Any) -> None:
+        # A log on a full disk, or nobody who reads (where rich would exit): the map is kept all the same.
+        with contextlib.suppress(OSError, SystemExit):
+            print_line(event, members)
+
+    def print_line(event: str, members: dict[str, Any]) -> None:
+        if as_json:
+            time = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+            sys.stdout.write(json.dumps({"time": time, "event": event, **members}, ensure_ascii=False) + "\n")
+            sys.stdout.flush()
+        else:
+            style = "red" if event in ("failed", "refused", "damaged") else None
+            output.say(f"{event}: {_line(members)}", style=style)
+
+    return log
 
 
 def _line(members: dict[str, Any]) -> str:

@@ -156,7 +156,7 @@ def whole(into: Path) -> dict[str, Any]:
         assert (len(data), hashlib.sha256(data).hexdigest()) == (file["size"], file["sha256"]), file
     there = {str(p.relative_to(version)) for p in version.rglob("*") if p.is_file()}
     told = {f"{f['format']}/{f['name']}" for f in manifest["files"]}
-    assert there == told | {"manifest.json", "manifest.sig", "environment.sh"}
+    assert there == told | {"manifest.json", "manifest.sig", "environment.sh", "closures.json", "levels.json"}
     return manifest
 
 

@@ -7,7 +7,8 @@ import contextlib
 import hashlib
 import json
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime, timedelta, timezone
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -33,6 +34,11 @@ class Fake:
         self.channels: dict[str, tuple[int, int]] = {}
         self.sequence = 0
         self.more: dict[str, Any] = {}
+        self.closures: list[dict[str, Any]] | None = None
+        """None: a server that applies none. Each is written at the end of every file."""
+        self.signs_time = True
+        self.levels: dict[str, str] = {}
+        """Path of a file -> level."""
         self.ready: dict[str, Any] = {}
         self.planned: dict[str, Any] = {}
         self.statuses: list[dict[str, Any]] = []
@@ -62,6 +68,9 @@ class Fake:
         class Server(ThreadingHTTPServer):
             daemon_threads = True
 
+            def handle_error(self, *_: Any) -> None:
+                pass  # an agent that gives up a slow answer
+
         self._server = Server(("127.0.0.1", 0), Handler)
         self.url = f"http://127.0.0.1:{self._server.server_port}"
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True)
@@ -82,15 +91,29 @@ class Fake:
         self.sequence += 1
         self.channels[channel] = (version, self.sequence)
 
+    def close_edges(self, *edges: str) -> None:
+        """Accept closures of these edges, and end all others."""
+        self.closures = [{"id": edge, "kind": "edge", "level": "ground", "edge": edge} for edge in edges]
+        self.sequence += 1
+        self.channels = {name: (version, self.sequence) for name, (version, _) in self.channels.items()}
+
+    @property
+    def digest(self) -> str:
+        return hashlib.sha256(json.dumps(self.closures or []).encode()).hexdigest()
+
+    def file(self, path: str, version: int) -> bytes:
+        return self.versions[version - 1][path] + "".join(c["id"] for c in self.closures or []).encode()
+
     def manifest(self, ref: str) -> bytes:
         number, sequence = (int(ref), 1) if ref.isdigit() else self.channels[ref]
-        files = self.versions[number - 1]
+        originals = self.versions[number - 1]
+        files = {path: self.file(path, number) for path in originals}
         body = {
             "environment": PLACE,
             **({} if ref.isdigit() else {"channel": ref}),
             "sequence": sequence,
             "version": number,
-            "root": hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest(),
+            "root": hashlib.sha256(repr(sorted(originals.items())).encode()).hexdigest(),
             "expires": (datetime.now(timezone.utc) + timedelta(days=1)).isoformat(),
             "files": [
                 {
@@ -98,11 +121,19 @@ class Fake:
                     "name": path.partition("/")[2],
                     "size": len(data),
                     "sha256": hashlib.sha256(data).hexdigest(),
+                    **({"level": self.levels[path]} if path in self.levels else {}),
                 }
                 for path, data in sorted(files.items())
             ],
-            "layers": {"topology": hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:16]},
+            "layers": {"topology": hashlib.sha256(repr(sorted(originals.items())).encode()).hexdigest()[:16]},
         }
+        if self.closures is not None:
+            body |= {"overlays": self.closures, "overlays_digest": self.digest}
+        if self.levels:
+            names = sorted(set(self.levels.values()))
+            body["levels"] = [{"name": name, "elevation": 3.5 * k} for k, name in enumerate(names)]
+        if self.signs_time:
+            body["time"] = datetime.now(timezone.utc).isoformat()
         return json.dumps(body | self.more).encode()
 
     def answer(self, handler: BaseHTTPRequestHandler) -> None:
@@ -127,9 +158,10 @@ class Fake:
             key, signature = self.keys.sign(data)
             signed = f"{key}:{base64.b64encode(signature).decode()}"
             return send(handler, 200, data, etag=etag, **{"fleetmap-signature": signed})
-        data = self.versions[int(path[6]) - 1]["/".join(path[8:])]
+        data = self.file("/".join(path[8:]), int(path[6]))
+        more = {} if self.closures is None else {"fleetmap-overlays": self.digest}
         start = int((handler.headers.get("range") or "bytes=0-")[6:-1])
-        return send(handler, 206 if start else 200, data[start:])
+        return send(handler, 206 if start else 200, data[start:], **more)
 
 
 def send(handler: BaseHTTPRequestHandler, status: int, body: bytes, **headers: str) -> None:
@@ -142,16 +174,37 @@ def send(handler: BaseHTTPRequestHandler, status: int, body: bytes, **headers: s
     handler.wfile.write(body)
 
 
+@contextlib.contextmanager
+def run(one: One) -> Iterator[None]:
+    """It runs until the end of the block."""
+    one.agent.open()
+    thread = threading.Thread(target=one.agent.run, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        one.agent.stop()
+        thread.join(30)
+        assert not thread.is_alive(), "it does not end"
+        one.agent.close()
+
+
 class One:
     """An agent in this process: ``lines`` is what it told."""
 
     def __init__(
-        self, fake: Fake, into: Path, *on_change: str, formats: tuple[str, ...] = ("kml",), **more: Any
+        self,
+        fake: Fake,
+        into: Path,
+        *on_change: str,
+        formats: tuple[str, ...] = ("kml",),
+        clock: Callable[[], float] = time.time,
+        **more: Any,
     ) -> None:
         self.into = into
         self.lines: list[dict[str, Any]] = []
         options = Options(fake.url, PLACE, formats, into, robot="robot", on_change=on_change, **more)
-        self.agent = Agent(options, lambda what, **members: self.lines.append({"event": what, **members}))
+        self.agent = Agent(options, lambda what, **members: self.lines.append({"event": what, **members}), clock)
 
     def once(self) -> bool:
         """Take the folder, sync once, let go."""

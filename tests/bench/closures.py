@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-from app.agent.options import Options
 
 from app.agent.core import Agent
+from app.agent.options import Options
 from app.events import messages
 from tests.bench import http
 from tests.bench.events import ENVIRONMENT, TOKEN, served

@@ -9,6 +9,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -26,10 +27,26 @@ def ready_made() -> dict[str, Path]:
     return {path.stem: path for path in sorted(HERE.glob("*.sh"))}
 
 
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a command ended. status: None if it was killed. text: how it ended and what it printed last."""
+
+    status: int | None
+    text: str
+
+
 def run(
     command: str, variables: Mapping[str, str], seconds: float = HOOK_SECONDS, stopping: threading.Event | None = None
 ) -> str | None:
-    """Run a hook to its end: None, or what went wrong. A name of a ready-made one runs that; all else is shell.
+    """Run a hook to its end: None, or what went wrong. A name of a ready-made one runs that; all else is shell."""
+    outcome = execute(command, variables, seconds, stopping)
+    return None if outcome.status == 0 else f"--on-change {command} {outcome.text}"
+
+
+def execute(
+    command: str, variables: Mapping[str, str], seconds: float = HOOK_SECONDS, stopping: threading.Event | None = None
+) -> Outcome:
+    """Run a command, or the ready-made hook of this name, to its end.
 
     It is ended, with all that it started, after so many seconds, or where ``stopping`` is set meanwhile. What it leaves
     running in the background is left alone, and read from as long as it prints.
@@ -46,7 +63,7 @@ def run(
             start_new_session=True,
         )
     except OSError as error:
-        return f"--on-change {command}: {error.strerror}"
+        return Outcome(None, f"cannot be started: {error.strerror}")
     said = bytearray()
     reader = threading.Thread(target=_read, args=(process.stdout, said), name="fleetmap-hook", daemon=True)
     reader.start()
@@ -60,14 +77,14 @@ def run(
             os.killpg(process.pid, signal.SIGKILL)  # with all that it started
         process.wait()
     if status == 0:
-        return None
+        return Outcome(0, "ended with 0")
     reader.join(LOOK_SECONDS)
     text = " ".join(bytes(said[-TOLD:]).decode(errors="replace").split())
     if status is not None:
         how = f"ended with {status}"
     else:
         how = f"took more than {seconds:g} seconds" if time.monotonic() >= end else "was ended with the agent"
-    return f"--on-change {command} {how}: {text}" if text else f"--on-change {command} {how}"
+    return Outcome(status, f"{how}: {text}" if text else how)
 
 
 def _read(stream: IO[bytes], said: bytearray) -> None:

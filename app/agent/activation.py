@@ -1,0 +1,321 @@
+"""Switching to a map and having the robot load it.
+
+Before a switch the ``--before-switch`` commands decide when; after it the ``--on-change`` commands load the map. If
+they fail, ``current`` goes back to the version that the robot loaded last: what ``current`` says is what the robot
+drives by.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from app.agent import hooks
+from app.agent.folder import Folder
+from app.agent.levels import level_problem, level_variables, read_level
+from app.agent.options import Options
+from app.agent.state import StateStore, write_whole
+from app.agent.trust import Manifest
+from app.agent.web import Stopped
+
+NOT_NOW = 75
+"""Exit status of ``--before-switch`` that delays the switch (EX_TEMPFAIL of sysexits.h)."""
+
+BEFORE_SWITCH_SECONDS = 5.0
+"""Interval between two runs of ``--before-switch`` while it delays a switch."""
+
+BEFORE_SWITCH_LIMIT_SECONDS = 60.0
+"""Maximum run time of ``--before-switch``."""
+
+MAX_VARIABLE_BYTES = 100_000
+
+HOOK_SUCCESS = ("done", "unchanged")
+MAX_HOOK_STATUS_BYTES = 65_536
+MAX_HOOK_STEPS = 5
+
+LAYERS = ("imagery", "location", "objects", "occupancy", "topology", "voxels", "zones")
+"""Layers that may have changed if the server is too old to list them."""
+
+LogEvent = Callable[..., None]
+"""log(event, **members): one line of what happens."""
+
+
+class Retries:
+    """Growing pauses between attempts at what failed, by subject."""
+
+    def __init__(self, longest: float, first: Callable[[], float]) -> None:
+        self._longest, self._first = longest, first
+        self._failures: dict[str, tuple[int, float, str]] = {}
+
+    def failed(self, subject: str, reason: str) -> None:
+        """Note a failure: the next attempt is due later than after the one before."""
+        count = self._failures.get(subject, (0, 0.0, ""))[0] + 1
+        pause = min(self._longest, self._first() * 2 ** min(20, count - 1))
+        due = time.monotonic() + pause * random.uniform(0.5, 1.5)  # noqa: S311  jitter is no secret
+        self._failures[subject] = (count, due, reason)
+
+    def reason(self, subject: str) -> str | None:
+        """Return why a subject failed if its next attempt is not due yet."""
+        _, due, reason = self._failures.get(subject, (0, 0.0, None))
+        return reason if due > time.monotonic() else None
+
+    def keep_only(self, *subjects: str | None) -> None:
+        """Forget the failures of all other subjects: each may be tried at once."""
+        self._failures = {name: failure for name, failure in self._failures.items() if name in subjects}
+
+    @property
+    def next_due(self) -> float | None:
+        """Monotonic time of the next attempt, None if no subject waits for one."""
+        now = time.monotonic()
+        return min((due for _, due, _ in self._failures.values() if due > now), default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class Pending:
+    """A map that waits for ``--before-switch``. since: RFC 3339. members: of the log line ``switched``."""
+
+    name: str
+    manifest: Manifest
+    since: str
+    members: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a map. manifest: the map that ``detail`` is about; None for the one that ``current`` points to."""
+
+    state: Literal["active", "waiting", "failed"]
+    detail: str | None = None
+    manifest: Manifest | None = None
+
+
+ACTIVE = Outcome("active")
+
+
+class Activation:
+    """The switch of one map directory. Not thread-safe."""
+
+    def __init__(
+        self,
+        folder: Folder,
+        store: StateStore,
+        options: Options,
+        robot: str,
+        *,
+        log: LogEvent,
+        stopping: threading.Event,
+        retries: Retries,
+    ) -> None:
+        self._folder, self._store, self._options, self._robot = folder, store, options, robot
+        self._log, self._stopping = log, stopping
+        self.retries = retries
+        self.pending: Pending | None = None
+
+    def switch(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
+        """Switch to a built version if ``--before-switch`` agrees. The hooks run with ``load``.
+
+        Args:
+            members: of the log line ``switched``.
+            since: RFC 3339 time from which the version lies ready.
+        """
+        with self._folder.hooks_lock(self._stopping):
+            if self._options.before_switch:
+                self.pending = Pending(name, manifest, since, members)
+                self.protect()
+                if (outcome := self._before_switch(name, manifest, since)) is not None:
+                    return outcome
+            self.pending = None
+            self._folder.switch(name)
+        self.protect()
+        self._log("switched", **members)
+        return ACTIVE
+
+    def refusal(self, manifest: Manifest) -> Outcome | None:
+        """Return the failure of this very manifest if it is not to be tried again yet."""
+        self.retries.keep_only(identity(manifest), self._folder.standing)
+        reason = self.retries.reason(identity(manifest))
+        return None if reason is None else Outcome("failed", reason, manifest)
+
+    def is_waiting(self) -> bool:
+        """Whether ``--before-switch`` delays a switch."""
+        return self.pending is not None
+
+    def protect(self) -> None:
+        """Keep the folders of versions that may still be switched to."""
+        names = {self._store.value.working, self.pending.name if self.pending else None}
+        self._folder.protected = frozenset(name for name in names if name is not None)
+
+    def _before_switch(self, name: str, manifest: Manifest, since: str) -> Outcome | None:
+        """Run the commands: None if all agree to the switch."""
+        installed = self._folder.manifest(self._store.value.activated)
+        variables = self._variables(manifest, installed)
+        ready = self._folder.versions / name
+        variables |= {"FLEETMAP_NEXT": str(ready), "FLEETMAP_CLOSURES_FILE": str(ready / "closures.json")}
+        for command in self._options.before_switch:
+            ended = hooks.execute(command, variables, BEFORE_SWITCH_LIMIT_SECONDS, self._stopping)
+            if ended.status == 0:
+                continue
+            if self._stopping.is_set():
+                raise Stopped
+            if ended.status == NOT_NOW:
+                detail = (
+                    f"version {manifest.version} is ready since {since}: --before-switch {command} delays the switch"
+                )
+                return Outcome("waiting", detail, manifest)
+            reason = f"version {manifest.version} is refused: --before-switch {command} {ended.text}"
+            self.pending = None
+            self.retries.failed(identity(manifest), reason)
+            return Outcome("failed", reason, manifest)
+        return None
+
+    @property
+    def is_load_due(self) -> bool:
+        """Whether ``load`` would run the hooks now."""
+        name = self._folder.standing
+        return name is not None and self._store.value.activated != name and self.retries.reason(name) is None
+
+    def load(self) -> Outcome:
+        """Run the hooks for the current version if they have not run yet; go back to the last good one if they fail."""
+        name = self._folder.standing
+        manifest = self._folder.manifest(name)
+        if name is None or manifest is None or self._store.value.activated == name:
+            return ACTIVE
+        if (reason := self.retries.reason(name)) is not None:
+            return Outcome("failed", reason)
+        with self._folder.hooks_lock(self._stopping):
+            if (problem := self._run_hooks(name, manifest)) is None:
+                return ACTIVE
+            return self._go_back(name, manifest, problem)
+
+    def _go_back(self, name: str, manifest: Manifest, problem: str) -> Outcome:
+        """Put the version whose hooks succeeded last in place of one whose hooks failed."""
+        back = self._store.value.working
+        previous = self._folder.manifest(back)
+        if back is None or back == name or previous is None or self._folder.damaged(back, previous):
+            reason = f"version {manifest.version} is in place, but its robot has not taken it: {problem}"
+            self.retries.failed(name, reason)
+            return Outcome("failed", reason)
+        reason = (
+            f"version {manifest.version} is replaced by {previous.version}, since its robot has not taken it: {problem}"
+        )
+        self.retries.failed(identity(manifest), reason)
+        self._folder.switch(back)
+        self._log("restored", version=previous.version, root=previous.root, detail=problem)
+        if (second := self._run_hooks(back, previous)) is not None:
+            reason = f"{reason}; nor has it taken version {previous.version} again: {second}"
+            self.retries.failed(back, reason)
+        return Outcome("failed", reason, manifest)
+
+    def _run_hooks(self, name: str, manifest: Manifest) -> str | None:
+        """Run the ``--on-change`` commands: None if all succeeded, and the version counts as loaded."""
+        level = read_level(self._folder)
+        if (problem := level_problem(manifest, level)) is not None:
+            return problem
+        before = self._folder.manifest(self._store.value.activated)
+        if self._options.on_change:  # cut off in the middle, or taken back: what the robot has loaded is unknown
+            self._store.set(activated=None)
+        variables = self._variables(manifest, before)
+        self._folder.hook_status.unlink(missing_ok=True)
+        for command in self._options.on_change:
+            problem = hooks.run(command, variables, stopping=self._stopping)
+            if problem is not None:
+                if self._stopping.is_set():
+                    raise Stopped
+                return problem
+            self._log("hook", command=command, version=manifest.version)
+        self._store.set(activated=name, working=name)
+        self.protect()
+        return None
+
+    def hook_remark(self) -> str | None:
+        """Return the steps that the hooks of the current version did not do, as they wrote them."""
+        steps = [s for s in read_hook_status(self._folder.hook_status) if s["result"] not in HOOK_SUCCESS]
+        return "; ".join(f"{s['step']}: {s['result']}: {s['detail']}" for s in steps[:MAX_HOOK_STEPS]) or None
+
+    def _variables(self, manifest: Manifest, before: Manifest | None) -> dict[str, str]:
+        """Return the environment variables of a command. before: what the robot has loaded."""
+        files, layers = changed_files(before, manifest), changed_layers(before, manifest)
+        return hook_variables(self._folder, manifest, files, layers, read_level(self._folder), self._robot)
+
+
+def hook_variables(
+    folder: Folder, manifest: Manifest, files: Sequence[str], layers: Sequence[str], level: str | None, robot: str
+) -> dict[str, str]:
+    """Return the environment variables of a command.
+
+    Args:
+        files, layers: changed ones.
+        level: the one that the robot is on.
+    """
+    return {
+        "FLEETMAP_ENVIRONMENT": manifest.environment,
+        "FLEETMAP_VERSION": str(manifest.version),
+        "FLEETMAP_ROOT": manifest.root,
+        "FLEETMAP_CHANNEL": manifest.channel or "",
+        "FLEETMAP_SEQUENCE": str(manifest.sequence),
+        "FLEETMAP_CURRENT": str(folder.current),
+        **_file_variables(folder.path / "changed", files),
+        "FLEETMAP_LAYERS": " ".join(layers),
+        "FLEETMAP_ROBOT": robot,
+        "FLEETMAP_OVERLAYS": manifest.overlays_digest or "",
+        "FLEETMAP_CLOSURES_FILE": str(folder.current / "closures.json"),
+        "FLEETMAP_HOOK_STATUS": str(folder.hook_status),
+        **level_variables(manifest, level),
+    }
+
+
+def read_hook_status(path: Path) -> list[dict[str, str]]:
+    """Return the steps that hooks wrote to ``FLEETMAP_HOOK_STATUS``: JSON lines ``{"step", "result", "detail"}``."""
+    try:
+        with path.open("rb") as stream:
+            lines = stream.read(MAX_HOOK_STATUS_BYTES).splitlines()
+    except OSError:
+        return []
+    steps = []
+    for line in lines:
+        try:
+            body = json.loads(line)
+            steps.append({name: str(body[name])[:300] for name in ("step", "result", "detail")})
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue  # a line of something else, or cut off
+    return steps
+
+
+def identity(manifest: Manifest) -> str:
+    """Return the subject under which a failure of this manifest is noted: a newer sequence is another one."""
+    return f"{manifest.epoch} {manifest.sequence} {manifest.root} {manifest.closures_key}"
+
+
+def _file_variables(path: Path, names: Sequence[str]) -> dict[str, str]:
+    """List changed files in variables, and completely in the file ``path``.
+
+    A variable's size is limited (128 KiB on Linux): what does not fit is skipped from the deepest folders up.
+    """
+    write_whole(path, "".join(f"{name}\n" for name in names).encode())
+    remaining, fit = MAX_VARIABLE_BYTES, set()
+    for name in sorted(names, key=lambda n: (n.count("/"), n)):
+        remaining -= len(name.encode()) + 1
+        if remaining < 0:
+            break
+        fit.add(name)
+    return {"FLEETMAP_CHANGED": "\n".join(n for n in names if n in fit), "FLEETMAP_CHANGED_FILE": str(path)}
+
+
+def changed_files(old: Manifest | None, new: Manifest) -> list[str]:
+    """Return the paths of files that are new, removed or different."""
+    before, after = old.content if old else {}, new.content
+    return sorted(path for path in {*before, *after} if before.get(path) != after.get(path))
+
+
+def changed_layers(old: Manifest | None, new: Manifest) -> list[str]:
+    """Return the names of layers that are new, removed or different."""
+    if not new.layers:
+        return list(LAYERS)
+    before, after = old.layers if old else {}, new.layers
+    return sorted(name for name in {*before, *after} if before.get(name) != after.get(name))

@@ -1,0 +1,108 @@
+"""Trust in time: by which clock a manifest expires, and whether the server's answers are still fresh.
+
+A robot's clock may be wrong, set back by an attacker, or unset after a power cut. So expiry is judged by the newer of
+the clock and the newest signed time. A signed time far ahead of a plausible clock is not believed: a server whose
+clock was wrong for a while would else make all later manifests look expired. Freshness is judged by the monotonic clock
+alone, which nobody can set.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from app.agent.trust import Manifest
+
+PLAUSIBLE_SINCE = 1767225600.0
+"""2026-01-01: an earlier clock is unset, in seconds since 1970."""
+
+MAX_AHEAD_SECONDS = 12 * 3600.0
+"""Maximum distance of a believed signed time from a plausible clock. Manifests are valid for longer (a day): a server
+whose clock was this far ahead blocks no robot after it was put right.
+"""
+
+MAX_JUMP_SECONDS = 30 * 86400.0
+"""Maximum distance of a believed signed time from the newest one if the clock is unset."""
+
+STALE_SECONDS = 1800.0
+"""Time without a newer signed answer after which the server counts as frozen; at least three polls. Manifests are
+signed again every 600 seconds.
+"""
+
+BEHIND_SECONDS = 60.0
+"""Time after which a server that gives less than the bus announced is reported."""
+
+FORGET_SECONDS = 900.0
+"""Time after which an announcement that never came true is forgotten: on an open router anybody can put events."""
+
+
+class SignedClock:
+    """The newer of the robot's clock and the newest signed time. floor: the latter, in seconds since 1970."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self.floor = 0.0
+
+    def now(self) -> float:
+        """Return the time by which manifests expire."""
+        return max(self._clock(), self.floor)
+
+    def observe(self, manifest: Manifest) -> None:
+        """Take the time of a verified manifest into account."""
+        if manifest.time is None:
+            return
+        signed, clock = manifest.time.timestamp(), self._clock()
+        if clock >= PLAUSIBLE_SINCE:
+            limit = clock + MAX_AHEAD_SECONDS
+        else:
+            limit = self.floor + MAX_JUMP_SECONDS if self.floor else signed
+        if signed <= limit:
+            self.floor = max(self.floor, signed)
+
+
+class Freshness:
+    """Whether signed answers still become newer, and keep up with what the bus announces."""
+
+    def __init__(self, poll_seconds: float, time_text: Callable[[], str]) -> None:
+        self._stale_after = max(STALE_SECONDS, 3 * poll_seconds)
+        self._time_text = time_text
+        self._newest = 0.0
+        self._newest_at: tuple[float, str] = (time.monotonic(), time_text())
+        self._announced: tuple[int, float, str] | None = None
+
+    def observe(self, manifest: Manifest) -> None:
+        """Note a verified manifest. One of an older server has no time: its expiry moves likewise."""
+        signed = (manifest.time or manifest.expires).timestamp()
+        if signed > self._newest:
+            self._newest, self._newest_at = signed, (time.monotonic(), self._time_text())
+
+    def stale_problem(self) -> str | None:
+        """Return why the server counts as frozen, None if it does not."""
+        at, text = self._newest_at
+        if time.monotonic() - at <= self._stale_after:
+            return None
+        return (
+            f"no fresh signed answer since {text}: the server, or a proxy in front of it, repeats old answers. "
+            "Check the server's clock and the path to it"
+        )
+
+    def announce(self, sequence: int) -> None:
+        """Note the newest sequence that the bus announced for the channel."""
+        if self._announced is None or sequence > self._announced[0]:
+            self._announced = (sequence, time.monotonic(), self._time_text())
+
+    def behind_remark(self, accepted: int) -> str | None:
+        """Return that the server gives less than the bus announced, None if it keeps up.
+
+        accepted: the channel's newest accepted sequence.
+        """
+        if self._announced is None:
+            return None
+        sequence, at, text = self._announced
+        age = time.monotonic() - at
+        if accepted >= sequence or age > FORGET_SECONDS:
+            self._announced = None
+            return None
+        if age < BEHIND_SECONDS:
+            return None
+        return f"the bus announced sequence {sequence} at {text}, and the server's signed answers end at {accepted}"

@@ -1,0 +1,126 @@
+"""Levels of the installed map: ``levels.json``, the level that the robot is on, and loading another one."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from app.agent import hooks
+from app.agent.folder import Folder
+from app.agent.state import write_whole
+from app.agent.trust import Manifest
+from app.errors import Conflict, Invalid, NotFound, Unavailable
+
+MAX_LEVEL_BYTES = 4096
+
+
+def level_names(manifest: Manifest) -> list[str]:
+    """Return the names of a map's levels, lowest first."""
+    return [level.name for level in manifest.levels]
+
+
+def level_files(manifest: Manifest, level: str) -> list[str]:
+    """Return the paths of the files that belong to one level."""
+    return sorted(file.path for file in manifest.files if file.level == level)
+
+
+def read_level(folder: Folder) -> str | None:
+    """Return the level that the robot is on, None if none was ever chosen."""
+    try:
+        return (folder.path / "level").read_bytes()[:MAX_LEVEL_BYTES].decode(errors="replace").strip("\n") or None
+    except FileNotFoundError:
+        return None
+
+
+def level_problem(manifest: Manifest, level: str | None) -> str | None:
+    """Return why a robot on this level cannot load a map, None if it can."""
+    if level is None or level in level_names(manifest):
+        return None
+    names = ", ".join(level_names(manifest)) or "none"
+    return (
+        f"the robot is on level {level!r}, which version {manifest.version} does not have (levels: {names}): "
+        "choose another with fleetmap agent-level"
+    )
+
+
+def level_variables(manifest: Manifest, level: str | None) -> dict[str, str]:
+    """Return the hook variables of a level.
+
+    ``FLEETMAP_LEVEL_FOLDER`` is the folder of its files below ``<format>/``, empty for the default level.
+    """
+    folders = {
+        file.name.partition("/")[0] if "/" in file.name else ""
+        for file in manifest.files
+        if level is not None and file.level == level
+    }
+    return {
+        "FLEETMAP_LEVEL": level or "",
+        "FLEETMAP_LEVEL_FOLDER": folders.pop() if len(folders) == 1 else "",
+    }
+
+
+def write_hooks(folder: Folder, on_change: Sequence[str], robot: str) -> None:
+    """Store the agent's hooks for ``agent-level``."""
+    body = {"on_change": list(on_change), "robot": robot}
+    data = json.dumps(body, indent=1).encode() + b"\n"
+    path = folder.path / "hooks.json"
+    if not path.exists() or path.read_bytes() != data:
+        write_whole(path, data)
+
+
+def load_level(
+    directory: Path,
+    level: str,
+    variables: Callable[[Folder, Manifest, Sequence[str], Sequence[str], str | None, str], Mapping[str, str]],
+    log: Callable[..., None],
+) -> None:
+    """Run the agent's hooks for one level of the current map, and remember the level.
+
+    The agent may run meanwhile: its hooks and these wait for each other.
+
+    Args:
+        variables: builds the hook variables from directory, manifest, changed files and layers, level and robot.
+
+    Raises:
+        NotFound: there is no map, or it has no such level; names those it has.
+        Conflict: no agent has run in the directory, or it belongs to another user.
+        Unavailable: a hook failed; the level stays as it was.
+    """
+    folder = Folder(directory)
+    commands, robot = _read_hooks(folder.path / "hooks.json")
+    with folder.hooks_lock():
+        manifest = folder.manifest(folder.standing)
+        if manifest is None:
+            raise NotFound(f"{directory} holds no map yet: wait for the agent's first sync")
+        names = level_names(manifest)
+        if level not in names:
+            choice = f"choose one of {', '.join(names)}" if names else "the server lists no levels"
+            raise NotFound(f"unknown level {level[:80]!r}: {choice}")
+        folder.hook_status.unlink(missing_ok=True)
+        values = variables(folder, manifest, level_files(manifest, level), sorted(manifest.layers), level, robot)
+        for command in commands:
+            if (problem := hooks.run(command, values)) is not None:
+                raise Unavailable(f"level {level} is not loaded: {problem}")
+            log("hook", command=command, version=manifest.version, level=level)
+        write_whole(folder.path / "level", level.encode() + b"\n")
+        log("level", level=level, version=manifest.version)
+
+
+def _read_hooks(path: Path) -> tuple[list[str], str]:
+    try:
+        with path.open("rb") as stream:
+            owner = os.fstat(stream.fileno()).st_uid
+            body: Any = json.loads(stream.read())
+        commands, robot = body["on_change"], body["robot"]
+        if not isinstance(robot, str) or not all(isinstance(command, str) for command in commands):
+            raise TypeError("a command is not a text")
+    except FileNotFoundError:
+        raise Conflict(f"no agent has run in {path.parent}: start fleetmap agent --into {path.parent} first") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise Invalid(f"{path} cannot be read ({error}): restart the agent, which writes it again") from None
+    if owner not in (0, os.geteuid()):
+        raise Conflict(f"{path} belongs to user {owner}, and its commands would run as you: run this as that user")
+    return commands, robot

@@ -1,0 +1,129 @@
+"""Signed manifests: fetched, verified, and compared with what was accepted before."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from datetime import datetime, timezone
+
+from app.agent import trust
+from app.agent.folder import Folder
+from app.agent.freshness import Freshness, SignedClock
+from app.agent.options import Options
+from app.agent.requests import FormatRequest, encode_entries
+from app.agent.state import Mark, StateStore
+from app.agent.trust import Manifest
+from app.agent.web import Web
+from app.errors import Unavailable, Untrusted
+
+
+class Manifests:
+    """Manifests of one environment. Not thread-safe."""
+
+    def __init__(
+        self,
+        options: Options,
+        requests: Sequence[FormatRequest],
+        web: Web,
+        folder: Folder,
+        store: StateStore,
+        *,
+        clock: SignedClock,
+        freshness: Freshness,
+        log: Callable[..., None],
+    ) -> None:
+        self._options, self._web, self._folder, self._store = options, web, folder, store
+        self._clock, self._freshness, self._log = clock, freshness, log
+        count = len(options.formats)
+        self._required = [request.name for request in requests[:count]]
+        self._optional = [request.name for request in requests[count:]]
+        self._query = f"formats={encode_entries(requests[:count])}"
+        if options.optional:
+            self._query += f"&optional={encode_entries(requests[count:])}"
+        self._latest: tuple[str, str | None, Manifest] | None = None
+
+    def latest(self, channel: str, accept: Callable[[Manifest], bool] = lambda _: True) -> Manifest | None:
+        """Fetch the channel's manifest: None if the installed one is still it, or it is not accepted.
+
+        Raises:
+            Untrusted: it must not be used.
+        """
+        request_key = f"{channel}?{self._query}"
+        state, now = self._store.value, self._clock.now()
+        mark = state.marks.get(channel)
+        installed = self._folder.manifest(self._folder.standing)
+        etag, cached = None, None
+        if state.asked == request_key and state.expires > now and installed is not None and installed.mark == mark:
+            etag = state.etag  # else "not modified" would be said of a map that is not installed
+        elif self._latest is not None and self._latest[0] == request_key:
+            _, latest_etag, manifest = self._latest
+            if manifest.mark == mark and manifest.expires.timestamp() > now:
+                etag, cached = latest_etag, manifest
+        found = self._web.manifest(self._options.environment, channel, self._query, etag)
+        if found is None:
+            return cached if cached is not None and accept(cached) else None
+        manifest, key = self._verify(found[0], found[1], channel, mark)
+        if not accept(manifest):
+            return None
+        if state.key is not None and state.key != key:  # endorsed: what an old key signed is no measure any more
+            state = dataclasses.replace(state, marks={})
+            self._clock.floor = 0.0
+        self._clock.observe(manifest)
+        if state.key != key:
+            self._log("trusting", key=trust.key_id(key), detail="rotated" if state.key else "first contact")
+        state = dataclasses.replace(state, key=key, newest_time=self._clock.floor)
+        self._store.keep(state.marked(channel, manifest.mark))
+        self._latest = (request_key, found[2], manifest)
+        return manifest
+
+    def planned(self, version: int) -> Manifest:
+        """Fetch the manifest of a version that a channel is planned to move to. Raises Untrusted."""
+        closures = "&closures=apply" if self.has_closures else ""
+        found = self._web.manifest(self._options.environment, str(version), self._query + closures)
+        if found is None:
+            raise Unavailable(f"the server did not return the manifest of version {version}")
+        manifest, _ = self._verify(found[0], found[1], None, None)
+        if manifest.version != version:
+            raise Untrusted(f"the manifest is of version {manifest.version}, and {version} was asked for")
+        return manifest
+
+    def note_installed(self, manifest: Manifest) -> None:
+        """Note the ETag of the manifest that is now the current one."""
+        request_key, etag, latest = self._latest or ("", None, None)
+        if latest is not None and latest.data == manifest.data:
+            self._store.set(etag=etag, asked=request_key, expires=manifest.expires.timestamp())
+
+    @property
+    def closures_key(self) -> str:
+        """Digest of the closures in the newest manifest, empty if there are none."""
+        return self._latest[2].closures_key if self._latest else ""
+
+    @property
+    def has_closures(self) -> bool:
+        """Whether the server applies closures, by the newest manifest."""
+        manifest = self._latest[2] if self._latest else self._folder.manifest(self._folder.standing)
+        return manifest is not None and manifest.overlays_digest is not None
+
+    def missing_remark(self, manifest: Manifest) -> str | None:
+        """Return which optional formats a map lacks and why, None if it has all."""
+        present = {file.format for file in manifest.files}
+        lacking = [name for name in self._optional if name not in present]
+        reasons = [f"{name} ({manifest.missing[name]})" if name in manifest.missing else name for name in lacking]
+        return f"without optional {', '.join(reasons)}" if reasons else None
+
+    def _verify(self, data: bytes, signature: str, channel: str | None, mark: Mark | None) -> tuple[Manifest, bytes]:
+        """Return a manifest and the key that signed it. Raises Untrusted."""
+        state = self._store.value
+        key = trust.signer(data, signature, state.key, state.given, self._web.keys)
+        manifest = trust.parse(data, signature)
+        trust.check(
+            manifest,
+            environment=self._options.environment,
+            channel=channel,
+            formats=self._required,
+            optional=self._optional,
+            mark=mark if state.key in (None, key) else None,
+            now=datetime.fromtimestamp(self._clock.now(), timezone.utc),
+        )
+        self._freshness.observe(manifest)
+        return manifest, key

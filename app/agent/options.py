@@ -1,0 +1,55 @@
+"""Options of the agent: which map of which server, where to keep it, and which commands to run."""
+
+from __future__ import annotations
+
+import re
+import socket
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from app.errors import Invalid
+from app.events import messages
+from app.events.login import Login
+
+POLL_SECONDS = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How to run.
+
+    Attributes:
+        channel: None follows ``production`` if it exists, else ``latest``.
+        formats, optional: entries as ``occupancy_grid?level=L2``; optional ones are installed if the server has them.
+        before_switch: commands that decide when the robot may switch to a new map.
+        on_change: commands that load a map after the switch.
+        key: server key to trust at first contact.
+        zenoh_login: at the router; a password without a user is the robot's.
+        ca: authority that signed the server's certificate.
+    """
+
+    server: str
+    environment: str
+    formats: tuple[str, ...]
+    into: Path
+    channel: str | None = None
+    robot: str = ""
+    on_change: tuple[str, ...] = ()
+    token: str | None = None
+    key: str | None = None
+    poll_seconds: float = POLL_SECONDS
+    zenoh_connect: str | None = None
+    zenoh_prefix: str | None = None
+    zenoh_config: Path | None = None
+    zenoh_login: Login = field(default_factory=Login)
+    ca: Path | None = None
+    before_switch: tuple[str, ...] = ()
+    optional: tuple[str, ...] = ()
+
+
+def robot_name(text: str | None = None) -> str:
+    """Return a robot name that can be part of a key; default: the host's name. Raises Invalid."""
+    name = text or re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()).lstrip("_.-") or "robot"
+    if not messages.ROBOT_NAME.fullmatch(name):
+        raise Invalid(f"a robot's name is of letters, digits, dots, - and _, got {name!r}")
+    return name

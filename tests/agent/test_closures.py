@@ -1,0 +1,224 @@
+"""Closures reach a robot with the manifest, at once and on every channel, and leave it the same way."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.agent import core
+from app.events.messages import RobotStatus
+from tests.agent.conftest import whole
+from tests.agent.fake import Fake, One, run
+from tests.agent.test_luck import event
+from tests.events.conftest import eventually
+
+A, B = {"kml/map.kml": b"a" * 5000}, {"kml/map.kml": b"b" * 6000}
+
+Robot = Callable[..., One]
+
+
+@pytest.fixture
+def fake(tmp_path: Path) -> Iterator[Fake]:
+    made = Fake(tmp_path / "keys")
+    made.put(A)
+    made.close_edges()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def robot(fake: Fake, tmp_path: Path) -> Robot:
+    return lambda *on_change, **more: One(fake, tmp_path / "robot", *on_change, **more)
+
+
+def held(one: One) -> tuple[bytes, dict[str, Any]]:
+    """The map's bytes and closures.json of what stands."""
+    current = one.into / "current"
+    whole(one.into)
+    return (current / "kml" / "map.kml").read_bytes(), json.loads((current / "closures.json").read_text())
+
+
+def test_closure_comes_and_goes_with_an_event(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    hook = f'echo "$FLEETMAP_OVERLAYS" >> {tmp_path}/log; cp "$FLEETMAP_CLOSURES_FILE" {tmp_path}/closures'
+    one = robot(hook, poll_seconds=3600.0)
+    fake.move("production", 1)
+    with run(one):
+        eventually(lambda: one.saw("active", version=1))
+        assert held(one)[1] == {"digest": fake.digest, "closures": []}
+        root, name = whole(one.into)["root"], (one.into / "current").readlink().name
+        assert name == f"1-{root[:8]}"
+        fake.close_edges("e7")
+        one.agent._heard(event(fake.sequence, type="overlay.accepted", overlay="x"))
+        eventually(lambda: fake.statuses[-1].get("overlays") == fake.digest and fake.statuses[-1]["state"] == "active")
+        data, closures = held(one)
+        assert data.endswith(b"ae7")
+        assert [c["edge"] for c in closures["closures"]] == ["e7"]
+        assert json.loads((tmp_path / "closures").read_text()) == closures
+        assert whole(one.into)["root"] == root
+        assert (one.into / "current").readlink().name == f"{name}-{fake.digest[:8]}"
+        closed = fake.digest
+        fake.close_edges()
+        one.agent._heard(event(fake.sequence, type="overlay.ended"))
+        eventually(lambda: fake.statuses[-1]["overlays"] == fake.digest and fake.statuses[-1]["state"] == "active")
+        assert held(one)[0] == A["kml/map.kml"]
+        assert (one.into / "current").readlink().name == name
+        fake.asked.clear()
+        for kind in ("overlay.created", "overlay.rejected", "overlay.expired"):
+            one.agent._heard(event(fake.sequence + 1, type=kind))
+        time.sleep(0.3)
+        assert not fake.asked, "these change nothing that is in force"
+    assert (tmp_path / "log").read_text().split() == [fake.digest, closed, fake.digest]
+
+
+def test_closures_without_any_changed_file_are_a_switch(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    assert robot(f"echo x >> {tmp_path}/log").once()
+    digest = "1" * 64
+    fake.sequence += 1
+    fake.channels = {"latest": (1, fake.sequence)}
+    fake.more = {"overlays": [{"id": "p", "kind": "keepout", "level": "ground"}], "overlays_digest": digest}
+    one = robot(f"echo $FLEETMAP_CHANGED. >> {tmp_path}/log")
+    assert one.once()
+    assert held(one)[1]["digest"] == digest
+    assert (tmp_path / "log").read_text().split() == ["x", "."]
+    assert fake.asked[-1].endswith("formats=kml"), "no file is fetched"
+
+
+def test_closures_that_change_during_a_download_are_no_error(fake: Fake, robot: Robot) -> None:
+    assert robot().once()
+    fake.put(B)
+    changes = 2
+
+    def change(handler: BaseHTTPRequestHandler) -> bool:
+        nonlocal changes
+        if "/maps/" in handler.path and changes:
+            changes -= 1
+            fake.close_edges(f"e{changes}")
+        return False
+
+    fake.instead = change
+    one = robot()
+    assert one.once(), one.lines
+    assert held(one)[0].endswith(b"be0")
+    assert not one.saw("refused")
+    assert not one.saw("failed")
+    assert all("closures=apply" in path for path in fake.asked if "/maps/" in path)
+
+
+def test_file_that_is_gone_with_its_closure_is_no_error(fake: Fake, robot: Robot) -> None:
+    fake.versions[0] = {**A, "kml/mask.kml": b"m" * 100}
+
+    def change(handler: BaseHTTPRequestHandler) -> bool:
+        if "mask.kml" in handler.path and "kml/mask.kml" in fake.versions[0]:
+            fake.versions[0] = A
+            fake.close_edges()
+            handler.send_error(404)
+            return True
+        return False
+
+    fake.instead = change
+    one = robot()
+    assert one.once(), one.lines
+    assert [f["name"] for f in whole(one.into)["files"]] == ["map.kml"]
+
+
+def test_closures_that_never_agree_are_an_error(fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(core, "CLOSURES_SECONDS", 0.001)
+    assert robot().once()
+    fake.put(B)
+    asked = 0
+
+    def change(handler: BaseHTTPRequestHandler) -> bool:
+        nonlocal asked
+        if "/maps/" in handler.path:
+            asked += 1
+            fake.close_edges(f"e{asked}")
+        return False
+
+    fake.instead = change
+    one = robot()
+    assert not one.once()
+    assert "other closures than the manifest" in one.detail
+    assert asked <= 2 * (core.MAX_CLOSURE_CHANGES + 1)
+    assert whole(one.into)["version"] == 1
+    fake.instead = lambda _: False
+    assert robot().once()
+
+
+def test_planned_version_is_fetched_with_closures(fake: Fake, robot: Robot) -> None:
+    fake.close_edges("e7")
+    fake.move("production", 1)
+    fake.put(B)
+    fake.planned["production"] = {"version": 2}
+    one = robot()
+    assert one.once()
+    assert any("/versions/2/manifest" in path and "closures=apply" in path for path in fake.asked)
+    one = robot(poll_seconds=0.1)
+    with run(one):
+        eventually(lambda: one.saw("ready", version=2))
+        fake.close_edges("e8")
+        eventually(lambda: whole(one.into)["overlays_digest"] == fake.digest)
+        fake.asked.clear()
+        eventually(lambda: len(fake.asked) > 4)
+    fake.planned.clear()
+    fake.move("production", 2)
+    fake.asked.clear()
+    one = robot()
+    assert one.once()
+    assert held(one)[0].endswith(b"be8")
+    assert not [path for path in fake.asked if "/maps/" in path], "it was fetched before, with the new closure"
+
+
+def test_server_without_closures_gets_no_new_parameters(fake: Fake, robot: Robot) -> None:
+    fake.closures = None
+    fake.move("production", 1)
+    fake.put(B)
+    fake.planned["production"] = {"version": 2}
+    one = robot()
+    assert one.once()
+    assert held(one)[1] == {"digest": "", "closures": []}
+    assert not [path for path in fake.asked if "closures" in path]
+    assert not [status for status in fake.statuses if "overlays" in status]
+    fake.close_edges()
+    assert robot("exit 1").once() is True, "a server that begins to apply closures changes no map"
+
+
+def test_before_switch_is_asked_for_closures(fake: Fake, robot: Robot) -> None:
+    assert robot().once()
+    fake.close_edges("e7")
+    one = robot(before_switch=("grep -q e7 $FLEETMAP_CLOSURES_FILE && exit 75",))
+    assert not one.once()
+    assert fake.statuses[-1]["state"] == "ready"
+    assert held(one)[0] == A["kml/map.kml"]
+
+
+@pytest.mark.parametrize(
+    "members",
+    [
+        {"overlays": [7], "overlays_digest": "0" * 64},
+        {"overlays": [{}], "overlays_digest": "0" * 64},
+        {"overlays": [{"id": "x"}], "overlays_digest": None},
+        {"overlays_digest": "x"},
+        {"overlays": 7},
+    ],
+)
+def test_invalid_closures_are_refused(fake: Fake, robot: Robot, members: dict[str, Any]) -> None:
+    assert robot().once()
+    fake.put(B)
+    fake.more = members
+    one = robot()
+    assert not one.once()
+    assert "cannot be read" in one.detail
+    assert whole(one.into)["version"] == 1
+
+
+def test_status_carries_the_digest() -> None:
+    body = {"channel": "latest", "version": 1, "root": "0" * 64, "state": "active", "overlays": "1" * 64}
+    status = RobotStatus.from_dict(body)
+    assert status.overlays == "1" * 64
+    assert status.as_dict() == body

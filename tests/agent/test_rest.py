@@ -1,0 +1,41 @@
+"""What an agent costs a robot while nothing happens: memory of its own (PSS) and processor time."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from tests.agent.conftest import Start
+from tests.api.conftest import Api
+from tests.events.conftest import eventually
+
+MAX_PSS_BYTES = 60 * 10**6
+MAX_CORE_SHARE = 0.002
+SECONDS = 20.0
+
+
+def pss(pid: int) -> int:
+    """Proportional set size: shared pages count by the number of processes that share them."""
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("Pss:"))
+
+
+def processor_seconds(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def test_agent_at_rest_costs_little(api: Api, place: str, robot: Start) -> None:
+    one = robot("--on-change", "true")
+    one.wait("active", version=1)
+    one.wait("connected")
+    eventually(lambda: api.get(f"robots/robot?environment={place}").json()["state"] == "active")
+    time.sleep(2)
+    before, begun = processor_seconds(one.process.pid), time.monotonic()
+    time.sleep(SECONDS)
+    share = (processor_seconds(one.process.pid) - before) / (time.monotonic() - begun)
+    memory = pss(one.process.pid)
+    assert memory <= MAX_PSS_BYTES, f"{memory / 1e6:.1f} MB"
+    assert share <= MAX_CORE_SHARE + 0.01 / SECONDS, f"{share:.3%} of a core"  # the kernel counts in 10 ms
+    assert one.stop() == 0

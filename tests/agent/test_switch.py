@@ -1,0 +1,319 @@
+"""Before and after a switch: when a robot takes a map, and what it drives by if it cannot load it."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.agent import activation, core
+from tests.agent.conftest import ROOT, whole
+from tests.agent.fake import PLACE, Fake, One, run, send
+from tests.events.conftest import eventually
+
+A, B, C = ({"kml/map.kml": letter * 5000} for letter in (b"a", b"b", b"c"))
+
+Robot = Callable[..., One]
+
+
+@pytest.fixture
+def fake(tmp_path: Path) -> Iterator[Fake]:
+    made = Fake(tmp_path / "keys")
+    made.put(A)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def robot(fake: Fake, tmp_path: Path) -> Robot:
+    """A new agent of one directory, as after a restart."""
+    return lambda *on_change, **more: One(fake, tmp_path / "robot", *on_change, **more)
+
+
+@pytest.fixture(autouse=True)
+def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 0.05)
+    monkeypatch.setattr(core, "BEFORE_SWITCH_SECONDS", 0.05)
+
+
+def exits(path: Path) -> str:
+    """A command that logs the version and ends with the status in a file."""
+    return f'echo "$FLEETMAP_VERSION" >> {path}.log; exit $(cat {path})'
+
+
+def calls(path: Path) -> list[str]:
+    log = path.with_name(path.name + ".log")
+    return log.read_text().split() if log.exists() else []
+
+
+def loads(taken: Path) -> str:
+    """A hook that loads each map but those with b."""
+    return f"cd $FLEETMAP_CURRENT/kml; grep -q b map.kml && {{ echo 'no b'; exit 3; }}; cp map.kml {taken}"
+
+
+def state(one: One) -> dict[str, Any]:
+    body: dict[str, Any] = json.loads((one.into / "state.json").read_text())
+    return body
+
+
+# --- before ---
+
+
+def test_before_switch_delays_until_it_agrees(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    status = tmp_path / "status"
+    status.write_text("0")
+    assert robot(before_switch=(exits(status),)).once(), "the first map is a switch, too"
+    assert calls(status) == ["1"]
+    status.write_text("75")
+    fake.put(B)
+    one = robot(f"touch {tmp_path}/hook", before_switch=(exits(status),), poll_seconds=3600.0)
+    with run(one):
+        eventually(lambda: calls(status).count("2") >= 3)
+        assert whole(one.into)["version"] == 1
+        asked = [path for path in fake.asked if "/manifest" in path]
+        eventually(lambda: fake.statuses[-1]["state"] == "ready")
+        assert fake.statuses[-1]["version"] == 2
+        assert fake.statuses[-1]["sequence"] == 1, "of what it drives by"
+        since = next(x for x in one.lines if x["event"] == "ready")["detail"]
+        assert "is ready since 20" in since
+        count = len(fake.statuses)
+        eventually(lambda: calls(status).count("2") >= 6)
+        assert len(fake.statuses) == count, "each refusal is not another status"
+        assert [path for path in fake.asked if "/manifest" in path] == asked, "the server is not asked each time"
+        status.write_text("0")
+        eventually(lambda: one.saw("active", version=2))
+        eventually(lambda: fake.statuses[-1]["state"] == "active")
+    assert whole(one.into)["version"] == 2
+    assert (tmp_path / "hook").exists()
+
+
+def test_before_switch_sees_both_maps(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    compares = f"cat $FLEETMAP_CURRENT/kml/map.kml $FLEETMAP_NEXT/kml/map.kml > {tmp_path}/both; "
+    compares += f'echo "$FLEETMAP_CHANGED $FLEETMAP_LAYERS" > {tmp_path}/changed'
+    assert robot().once()
+    fake.put(B)
+    assert robot(before_switch=(compares,)).once()
+    assert (tmp_path / "both").read_bytes() == A["kml/map.kml"] + B["kml/map.kml"]
+    assert (tmp_path / "changed").read_text() == "kml/map.kml topology\n"
+
+
+def test_newer_map_replaces_the_one_that_waits(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    assert robot().once()
+    fake.put(B)
+    (tmp_path / "status").write_text("75")
+    one = robot(before_switch=(exits(tmp_path / "status"),), poll_seconds=0.3)
+    with run(one):
+        eventually(lambda: one.saw("ready", version=2))
+        fake.put(C)
+        eventually(lambda: one.saw("ready", version=3))
+        fake.move("latest", 1)
+        eventually(lambda: one.saw("active", version=1))
+        count = len(calls(tmp_path / "status"))
+        time.sleep(0.3)
+        assert len(calls(tmp_path / "status")) == count, "nothing waits any more"
+        fake.move("latest", 3)
+        (tmp_path / "status").write_text("0")
+        eventually(lambda: one.saw("active", version=3))
+
+
+@pytest.mark.parametrize(
+    ("command", "word"), [("echo no; exit 7", "ended with 7: no"), ("sleep 60", "took more than 0.2")]
+)
+def test_before_switch_refuses_a_version(
+    fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, word: str
+) -> None:
+    monkeypatch.setattr(activation, "BEFORE_SWITCH_LIMIT_SECONDS", 0.2)
+    assert robot().once()
+    fake.put(B)
+    refuses = f"echo x >> {tmp_path}/log; [ $FLEETMAP_VERSION != 2 ] || {{ {command}; }}"
+    one = robot(before_switch=(refuses,), poll_seconds=3600.0)
+    monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 600.0)
+    with run(one):
+        eventually(lambda: fake.statuses[-1]["state"] == "failed")
+        assert word in fake.statuses[-1]["detail"]
+        assert fake.statuses[-1]["version"] == 2
+        assert whole(one.into)["version"] == 1
+        one.agent._wake.set()
+        time.sleep(0.3)
+        assert (tmp_path / "log").read_text().split() == ["x"], "the same version is not asked for again at once"
+        fake.put(C)
+        one.agent._wake.set()
+        eventually(lambda: one.saw("active", version=3))
+
+
+def test_once_ends_while_before_switch_delays(fake: Fake, robot: Robot) -> None:
+    one = robot(before_switch=("exit 75",))
+    assert not one.once()
+    assert fake.statuses[-1]["state"] == "ready"
+    assert not (one.into / "current").exists()
+
+
+# --- after ---
+
+
+def test_failed_hook_puts_the_last_good_version_back(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    taken = tmp_path / "taken"
+    assert robot(loads(taken)).once()
+    fake.put(B)
+    one = robot(loads(taken))
+    assert not one.once()
+    assert whole(one.into)["version"] == 1
+    assert taken.read_bytes() == A["kml/map.kml"]
+    last = fake.statuses[-1]
+    assert (last["state"], last["version"], last["sequence"]) == ("failed", 2, 1)
+    assert "no b" in last["detail"]
+    assert not any(s["state"] == "active" and s["version"] == 2 for s in fake.statuses)
+    assert state(one)["activated"] == state(one)["working"] == (one.into / "current").readlink().name
+    fake.put(C)
+    again = robot(loads(taken))
+    assert again.once(), again.lines
+    assert whole(one.into)["version"] == 3
+    assert taken.read_bytes() == C["kml/map.kml"]
+
+
+def test_failed_hook_is_tried_again_ever_later(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    assert robot("true").once()
+    fake.put(B)
+    log = f"echo $FLEETMAP_VERSION >> {tmp_path}/log"
+    one = robot(f"{log}; test $FLEETMAP_VERSION = 1 || test -e {tmp_path}/mended", poll_seconds=3600.0)
+    with run(one):
+        eventually(lambda: (tmp_path / "log").exists() and len((tmp_path / "log").read_text().split()) >= 6)
+        for _ in range(20):
+            one.agent._wake.set()  # forged events are no reason to try at once
+            time.sleep(0.02)
+        assert len((tmp_path / "log").read_text().split()) < 16
+        assert whole(one.into)["version"] in (1, 2)
+        (tmp_path / "mended").touch()
+        eventually(lambda: one.saw("active", version=2), 60)
+    assert whole(one.into)["version"] == 2
+
+
+def test_first_version_stays_if_its_hook_fails(fake: Fake, robot: Robot) -> None:
+    one = robot("exit 1")
+    assert not one.once()
+    assert whole(one.into)["version"] == 1
+    assert (fake.statuses[-1]["state"], fake.statuses[-1]["version"]) == ("failed", 1)
+    assert state(one)["working"] is None
+    assert robot("true").once()
+
+
+def test_version_is_kept_for_going_back(fake: Fake, robot: Robot) -> None:
+    assert robot("true").once()
+    for number in range(5):
+        fake.put({"kml/map.kml": bytes([number]) * 4000})
+        assert not robot("test $FLEETMAP_VERSION = 1").once()
+        assert whole(robot().into)["version"] == 1
+
+
+def test_hook_that_fails_for_both_versions(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    assert robot("true").once()
+    fake.put(B)
+    one = robot(f"test -e {tmp_path}/mended")
+    assert not one.once()
+    assert "nor has it taken version 1 again" in one.detail
+    assert whole(one.into)["version"] == 1
+    assert state(one)["activated"] is None
+    fake.move("latest", 1)
+    (tmp_path / "mended").touch()
+    again = robot(f"test -e {tmp_path}/mended")
+    assert again.once()
+    assert again.saw("hook", version=1), "what the robot has loaded is unknown: it loads again"
+
+
+def test_planned_version_is_fetched_while_the_standing_one_fails(fake: Fake, robot: Robot) -> None:
+    fake.move("production", 1)
+    assert robot("true").once()
+    fake.put(B)
+    fake.put(C)
+    fake.move("production", 2)
+    fake.planned["production"] = {"version": 3}
+    one = robot("test $FLEETMAP_VERSION != 2", poll_seconds=0.1)
+    with run(one):
+        eventually(lambda: fake.statuses[-1]["state"] == "ready")
+        ready = fake.statuses[-1]
+        assert ready["version"] == 3
+        assert "version 2" in ready["detail"]
+        assert any(s["state"] == "failed" and s["version"] == 2 for s in fake.statuses)
+        time.sleep(0.5)
+        assert fake.statuses[-1] == ready
+        fake.planned.clear()
+        fake.move("production", 3)
+        eventually(lambda: fake.statuses[-1]["state"] == "active")
+    assert whole(one.into)["version"] == 3
+
+
+def test_planned_version_is_fetched_while_the_manifest_cannot_be_had(fake: Fake, robot: Robot) -> None:
+    fake.move("production", 1)
+    assert robot().once()
+    fake.put(B)
+    fake.planned["production"] = {"version": 2}
+    fake.instead = lambda h: "/production/manifest" in h.path and (h.send_error(409) or True)
+    one = robot()
+    assert not one.once()
+    assert [s["state"] for s in fake.statuses][-2:] == ["failed", "ready"]
+    assert fake.statuses[-1]["version"] == 2
+
+
+def test_hooks_that_were_cut_off_run_without_a_server(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    assert robot("true").once()
+    path = robot().into / "state.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "activated": None}))
+    fake.instead = lambda h: send(h, 503, b"") or True  # type: ignore[func-returns-value]
+    one = robot(f"touch {tmp_path}/loaded")
+    assert not one.once()
+    assert (tmp_path / "loaded").exists()
+    assert one.saw("active", version=1)
+
+
+def test_state_of_an_older_agent_is_read(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    one = robot("true")
+    assert one.once()
+    new = state(one)
+    old = {
+        **new,
+        "form": 1,
+        "marks": {c: {"sequence": m["sequence"], "root": m["root"]} for c, m in new["marks"].items()},
+    }
+    for name in ("working", "newest_time"):
+        del old[name]
+    (one.into / "state.json").write_text(json.dumps(old))
+    fake.put(B)
+    assert not robot("test $FLEETMAP_VERSION = 1").once()
+    assert whole(one.into)["version"] == 1, "the version that ran is the one to go back to"
+    assert state(one)["form"] == 2
+
+
+def test_kill_at_random_moments_of_hooks_ends_consistently(fake: Fake, tmp_path: Path) -> None:
+    into, taken, dice = tmp_path / "robot", tmp_path / "taken", random.Random(3)
+    hook = f"sleep 0.1; {loads(taken)}; sleep 0.1"
+    arguments = ["agent", "-s", fake.url, "-e", PLACE, "-f", "kml", "--into", str(into), "--poll", "3600", "--json"]
+    arguments += ["--before-switch", "sleep 0.1", "--on-change", hook]
+    command = [sys.executable, "-m", "app.cli", *arguments]
+    variables = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT)}
+    assert One(fake, into, hook).once()
+    fake.put(B)
+    for _ in range(6):
+        process = subprocess.Popen(command, env=variables, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        assert process.stdout is not None
+        assert process.stdout.readline(), "it has begun"
+        time.sleep(dice.uniform(0.2, 1.5))
+        process.send_signal(signal.SIGKILL)
+        process.wait(10)
+        process.stdout.close()
+        assert whole(into)["version"] in (1, 2)
+        one = One(fake, into, hook)
+        assert not one.once()
+        assert whole(into)["version"] == 1
+        assert taken.read_bytes() == A["kml/map.kml"], "the robot drives by what current says"
+    fake.put(C)
+    assert One(fake, into, hook).once()
+    assert taken.read_bytes() == C["kml/map.kml"]
