@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.agent.conftest import ROOT, Robot, Start, network, whole
+from tests.agent.conftest import ROOT, Robot, Start, find_python310, network, whole
 from tests.api.conftest import Api
 from tests.events.conftest import eventually
 
@@ -22,26 +22,11 @@ SERVER = re.compile(
 """Imports of a test module that needs the server's packages."""
 
 
-def find_python() -> Path | None:
-    """A Python 3.10 of this machine."""
-    named = os.environ.get("FLEETMAP_PYTHON310") or shutil.which("python3.10")
-    places = [Path(named)] if named else []
-    places += sorted(Path.home().glob(".pyenv/versions/3.10.*/bin/python3.10"))
-    for path in places:
-        ended = subprocess.run(
-            [path, "-c", "import sys, venv; print(*sys.version_info[:2])"], capture_output=True, text=True, check=False
-        )
-        if ended.stdout.split() == ["3", "10"]:
-            return path
-    return None
-
-
 @pytest.fixture(scope="module")
 def python310(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The interpreter of an environment with the robot's install, built from the lock file."""
-    python = find_python()
-    if python is None:
-        pytest.skip("no Python 3.10 was found: name one with FLEETMAP_PYTHON310")
+    python = find_python310()
+    assert python is not None  # else this file is not collected
     uv = shutil.which("uv") or str(Path(sys.executable).with_name("uv"))
     place = tmp_path_factory.mktemp("python310") / "venv"
     command = [uv, "sync", "--frozen", "--no-editable", "--no-default-groups", "--group", "robot", "--quiet"]
