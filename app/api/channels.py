@@ -41,17 +41,18 @@ def as_dict(channel: Channel, robots: Sequence[Robot] | None, now: datetime) -> 
         "version": channel.version,
         "root": channel.root,
         "sequence": channel.sequence,
-        "overlays": {
-            "count": len(channel.closures.items),
-            "digest": channel.closures.digest,
-            "sequence": channel.closures_sequence,
-        },
         "author": channel.author,
         "time": rfc3339(channel.time),
         "planned": planned,
         "rollout": channel.rollout.as_dict() if channel.rollout else None,
     }
     if robots is not None:
+        closures = channel.closures
+        out["overlays"] = {
+            "count": len(closures.items),
+            "digest": closures.digest,
+            "sequence": channel.closures_sequence,
+        }
         root = channel.planned.root if channel.planned else None
         out["robots"] = fleet.holding(robots, channel, now, root).as_dict()
     return out

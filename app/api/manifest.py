@@ -28,7 +28,7 @@ from app.convert.recipe import own_options
 from app.errors import CannotConvert, CannotDerive, FleetMapError, Invalid, NotFound, Problem
 from app.events.messages import SIGNATURE
 from app.model.closures import NO_CLOSURES, ClosureMode
-from app.store.values import Version, frame_line, rfc3339
+from app.store.values import Version, frame_line
 
 STEP_SECONDS = 600
 """The time of expiry moves in steps, so that a robot that polls gets the same bytes, and 304."""
@@ -173,19 +173,20 @@ def _signed(
     if channel is not None:
         body["channel"] = channel
     body |= {
-        "epoch": here.store.epoch(),
         "sequence": sequence,
         "version": version.number,
         "root": version.root,
-        "time": rfc3339(datetime.fromtimestamp(signed, UTC)),
-        "expires": rfc3339(datetime.fromtimestamp(signed + here.options.manifest_seconds, UTC)),
+        "time": _seconds(signed),
+        "expires": _seconds(signed + here.options.manifest_seconds),
         "levels": _levels(version),
         "files": files,
-        "missing": missing,
-        "overlays": [closure.as_dict() for closure in closures.items],
         "overlays_digest": closures.digest,
         "layers": _layers(version),
     }
+    # A robot pays for each byte with every change: what is empty is left out.
+    body |= {"epoch": epoch} if (epoch := here.store.epoch()) else {}
+    body |= {"missing": missing} if missing else {}
+    body |= {"overlays": [closure.as_dict() for closure in closures.items]} if closures.items else {}
     variables = here.maps.variables(version)
     if variables:
         body["variables"] = variables
@@ -195,6 +196,11 @@ def _signed(
     headers = {"etag": f'"{header[-40:-2]}"', "cache-control": "no-cache", SIGNATURE: header}
     here.hot.keep(request, env, headers, data, generation)
     return headers, data
+
+
+def _seconds(moment: float) -> str:
+    """RFC 3339 in UTC, to the second."""
+    return datetime.fromtimestamp(int(moment), UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def _listed(

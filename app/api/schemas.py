@@ -715,7 +715,9 @@ class ChannelOut(BaseModel):
     version: int | None
     root: str | None
     sequence: int
-    overlays: OverlaysOut = Field(description="The closures in force, the same on all channels.")
+    overlays: OverlaysOut | None = Field(
+        None, description="The closures in force, the same on all channels. Left out with `robots=false`."
+    )
     author: str
     time: datetime
     planned: dict[str, Any] | None = None
@@ -871,7 +873,10 @@ class ManifestOut(BaseModel):
 
     environment: str
     channel: str | None = None
-    epoch: int = Field(description="Rises when the server is restored from a backup. Order is by epoch, then sequence.")
+    epoch: int = Field(
+        0,
+        description="Rises when the server is restored from a backup; left out at 0. Order is by epoch, then sequence.",
+    )
     sequence: int
     version: int
     root: str
@@ -879,8 +884,10 @@ class ManifestOut(BaseModel):
     expires: datetime
     levels: list[ManifestLevel] = Field(description="From the lowest up.")
     files: list[ManifestFile]
-    missing: list[ManifestMissing]
-    overlays: list[dict[str, Any]] = Field(description="The closures in force that its files show, by id.")
+    missing: list[ManifestMissing] = Field([], description="Optional formats that cannot be given; left out if none.")
+    overlays: list[dict[str, Any]] = Field(
+        [], description="The closures in force that its files show, by id; left out if there are none."
+    )
     overlays_digest: str = Field(description="SHA-256 of that list; `Fleetmap-Overlays` of each file.")
     layers: dict[str, str] = Field(description="A hash of each layer: equal where the layer is, in any two versions.")
     variables: dict[str, str] | None = Field(
