@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Annotated, Any
+from urllib.parse import parse_qsl
 
 from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
@@ -129,13 +130,14 @@ async def get_manifest(
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """A format of the request, with the parameters of its maps."""
+    """A format of the request, with the parameters of its maps. requested: all of them, as texts."""
 
     format: str
     values: Mapping[str, str]
     derive: bool
     closures: ClosureMode | None
     required: bool
+    requested: Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +185,12 @@ def _signed(
         "overlays_digest": closures.digest,
         "layers": _layers(version),
     }
-    # A robot pays for each byte with every change: what is empty is left out.
+    # What is not the default is signed: nobody on the way can change what was requested. A robot pays for each byte
+    # with every change: what is empty is left out.
+    shown = version.closures.mode if version.closures is not None else "ignore"
+    parameters = {entry.format: entry.requested for entry in entries if entry.requested}
+    body |= {"closures": shown} if shown != "apply" else {}
+    body |= {"parameters": parameters} if parameters else {}
     body |= {"epoch": epoch} if (epoch := here.store.epoch()) else {}
     body |= {"missing": missing} if missing else {}
     body |= {"overlays": [closure.as_dict() for closure in closures.items]} if closures.items else {}
@@ -291,7 +298,7 @@ def _entry(text: str, where: str, *, required: bool) -> _Entry:
         own_options(fmt, values)
     except Invalid as error:
         raise Invalid(f"{name}: {error.detail}", error.problems) from None
-    return _Entry(name, values, derive, closures, required)
+    return _Entry(name, values, derive, closures, required, dict(parse_qsl(query, keep_blank_values=True)))
 
 
 async def _made(here: Services, recipe: Recipe, request: Request, who: Any) -> Made | Started | None:

@@ -888,6 +888,12 @@ class ManifestOut(BaseModel):
     overlays: list[dict[str, Any]] = Field(
         [], description="The closures in force that its files show, by id; left out if there are none."
     )
+    closures: Literal["mark", "ignore"] | None = Field(
+        None, description="How its files show the closures in force; left out for `apply`."
+    )
+    parameters: dict[str, dict[str, str]] = Field(
+        {}, description="The parameters that each format was requested with; left out if there are none."
+    )
     overlays_digest: str = Field(description="SHA-256 of that list; `Fleetmap-Overlays` of each file.")
     layers: dict[str, str] = Field(description="A hash of each layer: equal where the layer is, in any two versions.")
     variables: dict[str, str] | None = Field(

@@ -21,7 +21,6 @@ from app.api.schemas import CHANNEL, NAME, ActionsOut, EnvironmentPath, RobotPat
 from app.api.services import Here, Services
 from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.fleet import vda5050
-from app.model.frame import GROUND
 from app.store.values import Channel, Report, RobotState, Version
 
 router = APIRouter(tags=["vda5050"], route_class=Route)
@@ -136,17 +135,9 @@ def _has_level(fmt: formats.Format) -> bool:
     return any(field.name == "level" for field in dataclasses.fields(fmt.write_options))
 
 
-def _default_level(version: Version) -> str:
-    """``ground``, else the lowest level."""
-    names = [level.name for level in version.levels]
-    if not names or GROUND in names:
-        return GROUND
-    return min(version.levels, key=lambda level: level.elevation).name
-
-
 def _levels(version: Version, level: str | None) -> list[str]:
     """The levels that are asked for, the default one first. NotFound for one that the version does not have."""
-    default = _default_level(version)
+    default = vda5050.default_level(version)
     names = [default, *(other.name for other in version.levels if other.name != default)]
     if level == "*":
         return names
@@ -157,7 +148,7 @@ def _levels(version: Version, level: str | None) -> list[str]:
 
 def _other(version: Version, level: str) -> str | None:
     """The level's name where it is not the default one."""
-    return None if level == _default_level(version) else level
+    return None if level == vda5050.default_level(version) else level
 
 
 def _actions(version: Version, map_id: str, level: str | None, link: LinkedFile) -> dict[str, Any]:

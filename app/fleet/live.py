@@ -13,8 +13,8 @@ import shapely.geometry
 import yaml
 
 from app.errors import MissingDatum
+from app.fleet import vda5050
 from app.model.closures import Closure, Closures
-from app.model.frame import GROUND
 from app.model.geodesy import local_frame
 from app.store.values import Version
 
@@ -64,8 +64,8 @@ def _has_entry_event(lane: Sequence[Any], said: Mapping[str, Any], in_lift: Sequ
 def zone_sets(version: Version, closures: Closures, map_id: str) -> list[dict[str, Any]]:
     """Zone sets of VDA 5050 3.0, one for each level with closed areas. Raises MissingDatum for degrees without one.
 
-    Coordinates are local metres, vertices run counter-clockwise. The ground's map is ``map_id``, that of another level
-    ``map_id/LEVEL``.
+    Coordinates are local metres, vertices run counter-clockwise. The default level's map is ``map_id``, that of another
+    level ``map_id/LEVEL``.
     """
     out = []
     for level in sorted({c.level for c in closures.items if c.polygon is not None}):
@@ -78,7 +78,7 @@ def zone_sets(version: Version, closures: Closures, map_id: str) -> list[dict[st
                 zone_id = closure.id if len(rings) == 1 else f"{closure.id}/{n}"
                 zones.append({"zoneId": zone_id, "zoneType": "BLOCKED", "vertices": ring})
         digest = hashlib.sha256(json.dumps(zones, sort_keys=True).encode()).hexdigest()[:16]
-        map_of = map_id if level == GROUND else f"{map_id}/{level}"
+        map_of = vda5050.map_id_of(map_id, None if level == vda5050.default_level(version) else level)
         out.append({"zoneSet": {"zoneSetId": f"{map_of}-{digest}", "mapId": map_of, "zones": zones}})
     return out
 

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from app.errors import Invalid, Problem
+from app.model.frame import GROUND
+from app.store.values import Version
 
 MAX_MAPS = 1000
 MAX_ACTIONS = 10_000
@@ -47,6 +49,14 @@ class Maps:
     enabled: tuple[str, ...]
     disabled: tuple[str, ...]
     failed: tuple[tuple[str, str], ...]
+
+
+def default_level(version: Version) -> str:
+    """The level whose map is the site's: ``ground``, else the lowest one."""
+    names = [level.name for level in version.levels]
+    if not names or GROUND in names:
+        return GROUND
+    return min(version.levels, key=lambda level: level.elevation).name
 
 
 def map_id_of(site: str, level: str | None) -> str:

@@ -99,6 +99,20 @@ def test_manifest_lists_closures_and_a_higher_sequence(api: Api, farm: str) -> N
     assert "overlays" not in again
 
 
+def test_manifest_signs_what_was_requested(api: Api, farm: str) -> None:
+    """Else somebody between robot and server could ask for a map without closures in the robot's name."""
+    close(api, farm, edge="gate_barn")
+    place = f"environments/{farm}/versions/latest/manifest?formats="
+    assert not {"closures", "parameters"} & api.get(f"{place}tmap2").json().keys()
+    assert api.get(f"{place}tmap2&closures=ignore").json()["closures"] == "ignore"
+    assert api.get(f"environments/{farm}/versions/3/manifest?formats=tmap2").json()["closures"] == "ignore"
+    assert "closures" not in api.get(f"environments/{farm}/versions/3/manifest?formats=tmap2&closures=apply").json()
+    asked = api.get(f"{place}tmap2%3Fclosures%3Dmark,geojson,occupancy_grid%3Fgrid%3Dmap%26derive%3Dfalse").json()
+    assert asked["parameters"] == {
+        "tmap2": {"closures": "mark"}, "occupancy_grid": {"grid": "map", "derive": "false"}
+    }  # fmt: skip
+
+
 def test_area_closes_masks_and_the_edges_that_cross_it(api: Api, farm: str) -> None:
     promote(api, farm, 3)
     mask = f"/maps/{farm}/occupancy_grid/keepout.pgm"

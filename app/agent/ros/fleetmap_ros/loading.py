@@ -158,6 +158,9 @@ class Site:
         names, files = self._levels()
         if names and level not in names:
             raise LoadError(f"the map has no level {level!r}; it has {', '.join(names)}")
+        folders = {name.partition("/")[0] for name in files.get(level, ()) if "/" in name}
+        if len(folders) == 1:  # the folder's name is the level's, percent-encoded where it has to be
+            return folders.pop() + "/"
         below = any(name.startswith(f"{level}/") for name in files.get(level, ()))
         if below or any((folder / level).is_dir() for folder in self.folder.iterdir() if folder.is_dir()):
             return f"{level}/"
