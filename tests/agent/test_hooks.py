@@ -232,6 +232,21 @@ def test_another_level(ros: Path, current: Path) -> None:
         assert reason in told
 
 
+def test_level_whose_folder_has_another_name(ros: Path, current: Path) -> None:
+    """The server percent-encodes what no folder may be called."""
+    put(current, "occupancy_grid/Floor 1 %28east%29/map.yaml")
+    put(current, "occupancy_grid/map.yaml")
+    name, files = "Floor 1 (east)", {"occupancy_grid": ["Floor 1 %28east%29/map.yaml"]}
+    levels = [
+        {"name": "ground", "elevation": 0.0, "files": {"occupancy_grid": ["map.yaml"]}},
+        {"name": name, "elevation": 3.5, "files": files},
+    ]
+    put(current, "levels.json", {"levels": levels})
+    changed = variables(current, "occupancy_grid/Floor 1 %28east%29/map.yaml", FLEETMAP_LEVEL=name)
+    assert hooks.run("nav2", changed) is None
+    assert "/occupancy_grid/Floor 1 %28east%29/map.yaml" in called(ros)[0]
+
+
 def test_closed_edges_are_closed_and_opened_again(ros: Path, current: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     adjust = "/route_server/DynamicEdgesScorer/adjust_edges"
     changed = variables(current, "nav2_route/graph.geojson")
