@@ -356,7 +356,7 @@ def check(
     if (manifest.epoch, manifest.sequence) == (mark.epoch, mark.sequence) and manifest.root != mark.root:
         raise Untrusted(
             f"the manifest of sequence {manifest.sequence} has the root {manifest.root[:8]}, and {mark.root[:8]} was "
-            "seen under the same number: there are two servers with one key. If it was restored, remove state.json"
+            "seen under the same number: two servers use one key, or it was restored: raise its epoch"
         )
 
 

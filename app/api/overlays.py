@@ -168,7 +168,7 @@ def _polygon(given: Mapping[str, Any]) -> dict[str, Any]:
 
 @router.post("/{id}/accept", responses=told(OverlayOut, 404, 409, 422, 503), summary="Accept an overlay")
 def accept_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
-    """It is in force on every channel until its end: areas are keepout, edges are closed. No version changes."""
+    """Put it in force on every channel until its end: areas become keepout, edges are closed. No version changes."""
     now = datetime.now(UTC)
     overlay = here.store.overlay(env, id)
     if overlay.state == "pending" and overlay.expires <= now:
@@ -190,7 +190,7 @@ def reject_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Edito
 
 @router.post("/{id}/end", responses=told(OverlayOut, 404, 409), summary="End an accepted overlay now")
 def end_overlay(env: EnvironmentPath, id: OverlayPath, here: Here, who: Editor) -> Response:
-    """What it closed is free again on every channel."""
+    """Open the area or edge again, on every channel at once."""
     return answer(here.store.decide_overlay(env, id, "accepted", "ended", who.name, datetime.now(UTC)).as_dict())
 
 

@@ -367,7 +367,7 @@ class StatusHoldsBody(In):
     """A version that a robot has loaded."""
 
     version: int = Field(ge=0, lt=2**63)
-    root: str = Field(pattern=r"^[0-9a-f]{64}$", description="64 zeros: it has no map.")
+    root: str = Field(pattern=r"^[0-9a-f]{64}$", description="Root hash of the version; 64 zeros: no map is loaded.")
 
 
 class StatusBody(In):
@@ -397,7 +397,7 @@ class StatusBody(In):
         None, pattern=r"^[0-9a-f]{64}$", description="Digest of the closures in the map that it has loaded."
     )
     holds: StatusHoldsBody | None = Field(
-        None, description="What it has loaded, where the status is about another version; left out: as last reported."
+        None, description="The loaded map, if the status is about another version. Default: the last `active` one."
     )
 
 
@@ -427,7 +427,7 @@ class OverlayBody(In):
 
     kind: Literal["blocked"]
     polygon: dict[str, Any] | None = Field(None, description="GeoJSON Polygon or MultiPolygon.")
-    edge: str | None = Field(None, min_length=1, max_length=512, description="An edge's id.")
+    edge: str | None = Field(None, min_length=1, max_length=512, description="An edge's id: one direction of a lane.")
     crs: Literal["local", "wgs84"] | None = Field(
         None, description="What the polygon is in; default: wgs84 where there is a datum."
     )
@@ -438,7 +438,7 @@ class OverlayBody(In):
         le=2_592_000,
         description="How long it is blocked from now on; default: 3600 unless `expires` is given.",
     )
-    expires: Moment | None = Field(None, description="When it ends instead, an RFC 3339 time with zone.")
+    expires: Moment | None = Field(None, description="End, instead of `ttl_seconds`: RFC 3339 time with zone.")
     state: Literal["pending", "accepted"] = Field(
         "pending", description="`accepted` (editors only): in force at once, on every channel."
     )
@@ -507,7 +507,7 @@ class MatchOut(BaseModel):
     """Why an environment is an answer to a position."""
 
     by: Literal["fence", "floor", "datum"] = Field(
-        description="The GNSS fence; what is mapped as floor; the neighbourhood of the datum."
+        description="`fence`: inside the GNSS fence; `floor`: on mapped floor; `datum`: within 200 m of the datum."
     )
     area_m2: float = Field(description="Area of the fence, floor or neighbourhood in square metres.")
     distance_m: float | None = Field(description="Metres from the position to the datum, null if there is none.")
@@ -672,7 +672,7 @@ class TemplatesOut(BaseModel):
 
 
 class ChannelRobotsOut(BaseModel):
-    """How a channel's robots stand. ``since``: from when on all hold its root; null while any does not."""
+    """A channel's robots. ``since``: since when all hold its root and closures; null while any does not."""
 
     total: int
     online: int
@@ -848,7 +848,7 @@ class ManifestFile(BaseModel):
     """One file of a map."""
 
     format: str
-    name: str = Field(description="Below the folder of its level, where that is not the default one: `L2/map.yaml`.")
+    name: str = Field(description="With the folder of its level, if that is not the default one: `L2/map.yaml`.")
     size: int
     sha256: str
     level: str | None = Field(None, description="Of a file that belongs to one level.")
@@ -875,7 +875,7 @@ class ManifestOut(BaseModel):
     channel: str | None = None
     epoch: int = Field(
         0,
-        description="Rises when the server is restored from a backup; left out at 0. Order is by epoch, then sequence.",
+        description="Order is by epoch, then sequence. The operator raises it after a restore; left out at 0.",
     )
     sequence: int
     version: int

@@ -50,7 +50,7 @@ async def get_actions(
     map_id: Annotated[
         str | None,
         Query(
-            alias="mapId", min_length=1, max_length=256, description="What the fleet manager calls it; default: env."
+            alias="mapId", min_length=1, max_length=256, description="The map's id in the fleet manager. Default: env."
         ),
     ] = None,
     format: Annotated[
@@ -177,7 +177,7 @@ def post_state(
     here: Here,
     who: Reporter,
     environment: Annotated[
-        str | None, Query(pattern=NAME, description="Whose versions the maps are; default: the `mapId`.")
+        str | None, Query(pattern=NAME, description="Environment of the maps. Default: the `mapId` before `/`.")
     ] = None,
     map_id: Annotated[
         str | None, Query(alias="mapId", min_length=1, max_length=256, description="Only of this map.")

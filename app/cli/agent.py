@@ -39,7 +39,7 @@ def agent(
     ],
     into: Annotated[Path, typer.Option("--into", "-o", help="Folder; the maps are in its `current/<format>/`.")],
     optional: Annotated[
-        str, typer.Option("--optional", help="Formats to keep if the server can give them, comma-separated.")
+        str, typer.Option("--optional", help="Optional formats, comma-separated: installed if the server has them.")
     ] = "",
     channel: Annotated[
         str | None, typer.Option("--channel", help="Channel to follow [default: production if it exists, else latest].")
@@ -55,8 +55,8 @@ def agent(
         list[str] | None,
         typer.Option(
             "--before-switch",
-            help="Command to run when a new map is ready: exit status 0 switches, 75 asks again in some seconds, any "
-            "other refuses the map; repeatable.",
+            help="Command to run before each switch, also for a closure: exit status 0 switches, 75 runs it again "
+            "after 5 seconds, any other refuses the map; repeatable.",
         ),
     ] = None,
     key: Annotated[
@@ -111,7 +111,7 @@ def agent(
             metavar="DIR",
             callback=_copy_ros_package,
             is_eager=True,
-            help="Copy the ROS 2 package fleetmap_ros into this folder (a workspace's src), and end.",
+            help="Copy the ROS 2 package fleetmap_ros into this folder (a workspace's src) and exit.",
         ),
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="Bring the folder up to date once, and end.")] = False,
@@ -119,11 +119,11 @@ def agent(
     token: options.Token = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for all that happens.")] = False,
 ) -> None:
-    """Keep a folder at the channel's map, on a robot.
+    """Keep a robot's folder up to date with a channel's map.
 
-    It listens for events, fetches what differs, verifies signature and hashes, and switches `current` at once. It goes
-    on without a server or a network, and reports how the robot is. Its password at the router is
-    FLEETMAP_ZENOH_PASSWORD.
+    Listens for events, fetches what differs, verifies signature and hashes, and switches `current` in one step. Keeps
+    the map without a server or network, and reports the robot's status. FLEETMAP_ZENOH_PASSWORD is its password at the
+    Zenoh router.
     """
     from app.agent.core import Agent, Options, robot_name
     from app.agent.requests import parse_formats
@@ -192,10 +192,10 @@ def agent_level(
     level: Annotated[str, typer.Argument(help="Level that the robot is on now, as in `current/levels.json`.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for all that happens.")] = False,
 ) -> None:
-    """Load another level of the robot's map, after it has left a lift.
+    """Load another level of the robot's map, for example after a ride in a lift.
 
-    Runs the `--on-change` commands of the agent for that level and remembers the level for later maps. The agent may
-    run meanwhile.
+    Runs the agent's `--on-change` commands for that level and stores the level for later maps. Run it as the agent's
+    user; the agent may be running.
     """
     from app.agent.activation import hook_variables
     from app.agent.levels import load_level

@@ -120,7 +120,7 @@ def link(
         typer.Option("--version", "-V", help="Number or channel [default: production if there is one, else latest]."),
     ] = None,
     seconds: Annotated[
-        int | None, typer.Option("--seconds", min=1, help="Life of the link [default: the server's maximum, 24 h].")
+        int | None, typer.Option("--seconds", min=1, help="Life in seconds [default: the server's maximum, 86400].")
     ] = None,
     option: options.Options = None,
     derive: Annotated[bool, typer.Option("--derive/--no-derive", help="Derive layers that no source has told.")] = True,
@@ -130,7 +130,7 @@ def link(
 ) -> None:
     """Create a signed link to a map: an address that needs no token until it expires.
 
-    It names the version by number, so that it always gives the same bytes. Whoever has the link can read this map.
+    The link names the version by number, so it always returns the same bytes. Anyone who has it can read this map.
     """
     parameters: dict[str, str] = options.pairs(option)
     parameters |= {} if derive else {"derive": "false"}

@@ -229,7 +229,7 @@ def _pending_twin(connection: Connection, environment: Row[Any], overlay: Overla
         if same == (overlay.kind, overlay.level, overlay.polygon, overlay.edge, overlay.crs):
             return str(row.id)
     if len(theirs) >= MAX_OF_ONE:
-        raise Conflict(f"{MAX_OF_ONE} overlays of {overlay.reporter} wait for a decision: no more are taken")
+        raise Conflict(f"{overlay.reporter} has {MAX_OF_ONE} pending overlays, the maximum: wait for an editor")
     waiting = select(func.count()).select_from(table).where(*pending)
     if connection.execute(waiting).scalar_one() >= MAX_PENDING:
         raise Conflict(f"{MAX_PENDING} overlays of {environment.name} wait: accept or reject some")

@@ -401,7 +401,7 @@ def map_grid(grids: Sequence[str], names: Names) -> str | None:
         return "map"
     maps = [g for g in grids if g not in ("nogo", names.keepout_grid, names.speed_grid)]
     if len(maps) > 1:
-        raise LoadError(f"there are the grids {', '.join(maps)}: name one with FLEETMAP_NAV2_GRID")
+        raise LoadError(f"there are the grids {', '.join(maps)}: name one with FLEETMAP_NAV2_GRID (of the node: grid)")
     return maps[0] if maps else None
 
 
