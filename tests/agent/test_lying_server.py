@@ -9,7 +9,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta, timezone
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
@@ -128,7 +128,8 @@ def unknown_key(fake: Fake, folder: Path) -> None:
 
 
 def expired(fake: Fake, _: Path) -> None:
-    signs(fake, fake.keys, lambda body: {**body, "expires": (datetime.now(UTC) - timedelta(hours=1)).isoformat()})
+    hour_ago = datetime.now(timezone.utc) - timedelta(hours=1)
+    signs(fake, fake.keys, lambda body: {**body, "expires": hour_ago.isoformat()})
 
 
 def endless_file(fake: Fake, _: Path) -> None:
@@ -293,8 +294,8 @@ def test_server_that_gives_less_than_the_bus_announced_is_reported(
 def test_expired_map_is_refused_with_the_clock_set_back(fake: Fake, robot: Robot) -> None:
     assert robot().once()
     fake.put(B)
-    old = (datetime.now(UTC) - timedelta(days=1)).isoformat()
-    fake.more = {"expires": old, "time": (datetime.now(UTC) - timedelta(days=1, hours=1)).isoformat()}
+    old = (datetime.now(timezone.utc) - timedelta(days=1)).isoformat()
+    fake.more = {"expires": old, "time": (datetime.now(timezone.utc) - timedelta(days=1, hours=1)).isoformat()}
     one = robot(clock=lambda: time.time() - 2 * 86400)
     assert not one.once()
     assert "has expired" in one.detail
@@ -313,7 +314,7 @@ def test_clock_set_forward_heals_when_it_is_put_right(fake: Fake, robot: Robot) 
 
 def test_server_whose_clock_was_ahead_blocks_no_robot(fake: Fake, robot: Robot) -> None:
     for ahead in (timedelta(hours=11), timedelta(days=400)):
-        now = datetime.now(UTC) + ahead
+        now = datetime.now(timezone.utc) + ahead
         fake.more = {"time": now.isoformat(), "expires": (now + timedelta(days=1)).isoformat()}
         fake.put(B if ahead.days else A)
         assert robot().once()
@@ -327,7 +328,7 @@ def test_server_whose_clock_was_ahead_blocks_no_robot(fake: Fake, robot: Robot) 
 def test_unset_clock_is_replaced_by_signed_time(fake: Fake, robot: Robot) -> None:
     assert robot(clock=lambda: 1000.0).once()
     fake.put(B)
-    fake.more = {"expires": (datetime.now(UTC) - timedelta(hours=1)).isoformat()}
+    fake.more = {"expires": (datetime.now(timezone.utc) - timedelta(hours=1)).isoformat()}
     one = robot(clock=lambda: 1000.0)
     assert not one.once()
     assert "has expired" in one.detail

@@ -85,7 +85,7 @@ def test_repeated_requests_are_answered_from_memory(api: Api, farm: str, monkeyp
     first = api.get(path)
     time.sleep(1.1)
     first = api.get(path)
-    monkeypatch.setattr(Store, "version", away)
+    monkeypatch.setattr(Store, "standing", away)
     monkeypatch.setattr(Store, "find_token", away)
     for _ in range(5):
         again = api.get(path)
@@ -224,7 +224,8 @@ def test_credits_stand_in_reports(api: Api, bare: str) -> None:
     credit = ["Some Mappers", "https://example.org/copyright"]
     for name in ("osm", "kml", "tmap2"):
         report = api.get(f"environments/{bare}/versions/1/reports/{name}").json()
-        assert set(report) == {"format", "version", "layers", "attribution", "template", "dropped", "warnings"}
+        members = {"format", "version", "layers", "attribution", "template", "dropped", "warnings", "closures"}
+        assert set(report) == members
         assert report["attribution"] == credit
         told = {line["layer"]: line["attribution"] for line in report["layers"]}
         assert told["topology"] == credit

@@ -86,7 +86,7 @@ def test_onto_a_slice_of_objects_and_what_is_refused(fleetmap: Fleetmap, maps: P
         (("map", "--pair", "0,0=1,1"), "or give --pair"),
         (("map", "-O", "height=1"), "a stored grid has no parameters"),
         (("--pair", "0,0=1,1", "-O", "height=1"), "not to points"),
-        (("map", "--angle", "400"), "less than or equal to 180"),
+        (("map", "--angle", "400"), "0<=x<=180"),
     ):
         refused = fleetmap("align", "sliced", *wrong)
         assert refused.status == 2, wrong

@@ -124,7 +124,9 @@ def test_the_lock_file_knows_every_dependency() -> None:
     project = tomllib.loads((TOP / "pyproject.toml").read_text())
     lock = tomllib.loads((TOP / "uv.lock").read_text())
     locked = {package["name"] for package in lock["package"]}
-    wanted = project["project"]["dependencies"] + project["dependency-groups"]["dev"]
+    groups = project["dependency-groups"]
+    wanted = project["project"]["dependencies"] + groups["robot"]
+    wanted += [one for one in groups["dev"] if isinstance(one, str)]
     wanted += project["project"]["optional-dependencies"]["server"]
     names = {re.split(r"[\[<>=!~; ]", text, maxsplit=1)[0].lower().replace("_", "-") for text in wanted}
     assert not names - locked

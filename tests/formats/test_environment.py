@@ -354,11 +354,11 @@ def test_odd_variables_are_left_out_and_told(tmp_path: Path) -> None:
 
 
 def test_a_new_writer_of_an_inner_map_makes_a_new_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    version: Any = SimpleNamespace(datum=None, levels=(), templates=NO_TEMPLATES)
+    version: Any = SimpleNamespace(datum=None, levels=(), templates=NO_TEMPLATES, closures=None)
     way = recipe.Chain((), ())
 
     def keys() -> list[str]:
-        return [recipe._key(version, get_format(n), None, way, {}) for n in ("environment", "datum")]
+        return [recipe._key(version, get_format(n), None, way, {}, None) for n in ("environment", "datum")]
 
     before = keys()
     assert keys() == before
