@@ -37,6 +37,7 @@ class Manifests:
         count = len(options.formats)
         self._required = [request.name for request in requests[:count]]
         self._optional = [request.name for request in requests[count:]]
+        self._parameters = {request.name: dict(request.parameters) for request in requests if request.parameters}
         self._query = f"formats={encode_entries(requests[:count])}"
         if options.optional:
             self._query += f"&optional={encode_entries(requests[count:])}"
@@ -80,6 +81,8 @@ class Manifests:
         """Fetch the manifest of a version that a channel is planned to move to. Raises Untrusted."""
         closures = "&closures=apply" if self.has_closures else ""
         found = self._web.manifest(self._options.environment, str(version), self._query + closures)
+        if found is not None and not closures and trust.parse(found[0], found[1]).overlays_digest is not None:
+            found = self._web.manifest(self._options.environment, str(version), f"{self._query}&closures=apply")
         if found is None:
             raise Unavailable(f"the server did not return the manifest of version {version}")
         manifest, _ = self._verify(found[0], found[1], None, None)
@@ -122,6 +125,7 @@ class Manifests:
             channel=channel,
             formats=self._required,
             optional=self._optional,
+            parameters=self._parameters,
             mark=mark if state.key in (None, key) else None,
             now=datetime.fromtimestamp(self._clock.now(), timezone.utc),
         )

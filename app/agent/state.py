@@ -31,6 +31,7 @@ class Mark(NamedTuple):
     epoch: int
     sequence: int
     root: str
+    overlays_digest: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,9 @@ def load(path: Path, environment: str) -> State:
             given=body.get("given"),
             channel=body.get("channel"),
             marks={
-                str(c): Mark(int(m.get("epoch", 0)), int(m["sequence"]), str(m["root"]))
+                str(c): Mark(
+                    int(m.get("epoch", 0)), int(m["sequence"]), str(m["root"]), _text(m.get("overlays_digest"))
+                )
                 for c, m in body["marks"].items()
             },
             etag=body.get("etag"),
@@ -114,6 +117,10 @@ def save(path: Path, state: State) -> None:
         "newest_time": state.newest_time,
     }
     write_whole(path, json.dumps(body, indent=1).encode() + b"\n")
+
+
+def _text(value: Any) -> str | None:
+    return None if value is None else str(value)
 
 
 def _name(value: Any) -> str | None:

@@ -222,3 +222,72 @@ def test_status_carries_the_digest() -> None:
     status = RobotStatus.from_dict(body)
     assert status.overlays == "1" * 64
     assert status.as_dict() == body
+
+
+@pytest.mark.parametrize("ref", ["latest", "2"])
+@pytest.mark.parametrize(
+    ("members", "text"),
+    [
+        ({"closures": "ignore"}, "closures=ignore instead of apply"),
+        ({"closures": "mark"}, "closures=mark instead of apply"),
+        ({"parameters": {"kml": {"level": "L2"}}}, "'level': 'L2'"),
+        ({"parameters": {}}, "'crs': 'local'"),
+        ({"missing": []}, "without the optional osm"),
+        ({"closures": 7}, "cannot be read"),
+    ],
+)
+def test_manifest_of_another_request_is_refused(
+    fake: Fake, robot: Robot, members: dict[str, Any], text: str, ref: str
+) -> None:
+    fake.more = {"parameters": {"kml": {"crs": "local"}}, "missing": [{"format": "osm", "detail": "no network"}]}
+    more = {"formats": ("kml?crs=local",), "optional": ("osm",)}
+    assert robot(**more).once()
+    fake.put(B)
+    honest, fake.more = fake.more, fake.more | members
+    if ref == "2":
+        fake.move("production", 1)
+        fake.move("production", 1)
+        fake.planned["production"] = {"version": 2}
+        more["channel"] = "production"
+        fake.more, lie = honest, fake.more
+
+        def change(handler: BaseHTTPRequestHandler) -> bool:
+            fake.more = lie if "/versions/2/manifest" in handler.path else honest
+            return False
+
+        fake.instead = change
+    one = robot(**more)
+    assert not one.once()
+    assert text in one.detail
+    assert whole(one.into)["version"] == 1
+    assert fake.statuses[-1]["state"] == "failed"
+    fake.more, fake.instead = honest, lambda _: False
+    assert robot(**more).once()
+
+
+def test_request_is_not_checked_if_the_server_applies_no_closures(fake: Fake, robot: Robot) -> None:
+    fake.closures = None
+    assert robot(formats=("kml?crs=local",), optional=("osm",)).once()
+
+
+def test_other_closures_under_one_sequence_are_refused(fake: Fake, robot: Robot) -> None:
+    fake.close_edges("e7")
+    assert robot().once()
+    fake.closures = []
+    one = robot()
+    assert not one.once()
+    assert "under the same number" in one.detail
+    assert held(one)[0].endswith(b"ae7")
+    fake.close_edges()
+    assert robot().once()
+
+
+def test_first_digest_under_one_sequence_is_accepted(fake: Fake, robot: Robot) -> None:
+    assert robot().once()
+    path = robot().into / "state.json"
+    state = json.loads(path.read_text())
+    assert state["marks"]["latest"].pop("overlays_digest") == fake.digest
+    path.write_text(json.dumps(state))
+    fake.more = {"extra": 1}
+    assert robot().once()
+    assert json.loads(path.read_text())["marks"]["latest"]["overlays_digest"] == fake.digest
