@@ -116,6 +116,7 @@ class Activation:
         self._log, self._stopping = log, stopping
         self.retries = retries
         self.pending: Pending | None = None
+        self._replacement: str | None = None
 
     def switch(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
         """Switch to a built version if ``--before-switch`` agrees. The hooks run with ``load``.
@@ -136,9 +137,28 @@ class Activation:
         self._log("switched", **members)
         return ACTIVE
 
+    def replace(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
+        """Switch to the current version with other closures and run the hooks; a newer map goes on waiting.
+
+        A failure is tried again ever later, and the robot goes back to the closures that it has loaded.
+        """
+        self._replacement = identity(manifest)
+        if (reason := self.retries.reason(self._replacement)) is not None:
+            return Outcome("waiting", reason, manifest)
+        pending = self.pending
+        try:
+            outcome = self.switch(name, manifest, members, since)
+        finally:
+            if pending is not None:
+                self.pending = pending
+            elif self.pending is not None and self.pending.name == name:
+                self.pending = None
+            self.protect()
+        return self.load() if outcome.state == "active" else outcome
+
     def refusal(self, manifest: Manifest) -> Outcome | None:
         """Return the failure of this very manifest if it is not to be tried again yet."""
-        self.retries.keep_only(identity(manifest), self._folder.standing)
+        self.retries.keep_only(identity(manifest), self._folder.standing, self._replacement)
         reason = self.retries.reason(identity(manifest))
         return None if reason is None else Outcome("failed", reason, manifest)
 

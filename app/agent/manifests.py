@@ -102,6 +102,11 @@ class Manifests:
         return self._latest[2].closures_key if self._latest else ""
 
     @property
+    def overlays_digest(self) -> str | None:
+        """Digest of the closures of the newest manifest, None if there is none or the server applies none."""
+        return self._latest[2].overlays_digest if self._latest else None
+
+    @property
     def has_closures(self) -> bool:
         """Whether the server applies closures, by the newest manifest."""
         manifest = self._latest[2] if self._latest else self._folder.manifest(self._folder.standing)

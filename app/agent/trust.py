@@ -220,7 +220,12 @@ def _is_closure(value: object) -> bool:
 
 
 def _is_digest(value: object) -> bool:
-    return value is None or (isinstance(value, str) and _HASH.fullmatch(value) is not None)
+    return value is None or (isinstance(value, str) and is_hash(value))
+
+
+def is_hash(text: str) -> bool:
+    """Whether a text is a SHA-256 in hexadecimal digits."""
+    return _HASH.fullmatch(text) is not None
 
 
 def _check_variables(variables: Mapping[str, str]) -> None:

@@ -102,6 +102,12 @@ class Fake:
     def digest(self) -> str:
         return hashlib.sha256(json.dumps(self.closures or []).encode()).hexdigest()
 
+    def root(self, version: int) -> str:
+        return hashlib.sha256(repr(sorted(self.versions[version - 1].items())).encode()).hexdigest()
+
+    def plan(self, channel: str, version: int) -> None:
+        self.planned[channel] = {"version": version, "root": self.root(version)}
+
     def file(self, path: str, version: int) -> bytes:
         return self.versions[version - 1][path] + "".join(c["id"] for c in self.closures or []).encode()
 
@@ -114,7 +120,7 @@ class Fake:
             **({} if ref.isdigit() else {"channel": ref}),
             "sequence": sequence,
             "version": number,
-            "root": hashlib.sha256(repr(sorted(originals.items())).encode()).hexdigest(),
+            "root": self.root(number),
             "expires": (datetime.now(timezone.utc) + timedelta(days=1)).isoformat(),
             "files": [
                 {
