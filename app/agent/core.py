@@ -27,7 +27,7 @@ from app.agent.requests import parse_requests
 from app.agent.state import State, StateStore
 from app.agent.status import StatusReporter
 from app.agent.trust import File, Manifest
-from app.agent.web import Busy, ClosuresChanged, Stopped, Web
+from app.agent.web import Busy, ClosuresChanged, Stopped, Web, plain
 from app.errors import FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.events import messages
 from app.events.messages import RobotState, RobotStatus
@@ -304,8 +304,8 @@ class Agent:
             try:
                 found = self._web.readyz().get("events", {})
                 told = found.get("connect")
-                connect = connect or (str(told) if told else None)
-                prefix = prefix or str(found.get("prefix") or messages.PREFIX)
+                connect = connect or (plain(str(told)) if told else None)
+                prefix = prefix or plain(str(found.get("prefix") or messages.PREFIX))
             except (FleetMapError, AttributeError):
                 if connect is None or self._ear.aimed:
                     return
@@ -531,6 +531,8 @@ class Agent:
         outcome = self._activation.switch(name, manifest, members, since)
         if outcome.state == "active":
             self._installed(manifest)
+        else:
+            self._folder.tidy(self._preloaded.files if self._preloaded else ())
         return outcome
 
     def _installed(self, manifest: Manifest) -> None:
@@ -643,7 +645,7 @@ class Agent:
         overlays = current.overlays_digest if current else None
         # That of a version fetched by its number is of no move of the channel: the server goes by the root then.
         sequence = current.sequence if current and current.channel is not None else None
-        detail = detail[: messages.MAX_DETAIL] if detail else None
+        detail = plain(detail[: messages.MAX_DETAIL]) if detail else None
         holds = self._loaded(current)
         status = RobotStatus(channel, version, root, state, detail, self._time_text(), sequence, overlays, holds)
         if not self._status.set(status):
@@ -658,7 +660,9 @@ class Agent:
 
         A server that applies no closures does not know this member either.
         """
-        if current is None or current.overlays_digest is None:
+        if current is None:
+            return (0, NO_ROOT) if self._manifests.has_closures else None
+        if current.overlays_digest is None:
             return None
         return (current.version, current.root) if self._state.activated == self._folder.standing else None
 

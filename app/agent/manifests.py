@@ -64,6 +64,8 @@ class Manifests:
         if found is None:
             return cached if cached is not None and accept(cached) else None
         manifest, key = self._verify(found[0], found[1], channel, mark)
+        if self._clock.is_plausible(manifest):
+            self._freshness.observe(manifest, self._clock.local)
         if not accept(manifest):
             return None
         if state.key is not None and state.key != key:  # endorsed: what an old key signed is no measure any more
@@ -132,7 +134,9 @@ class Manifests:
             optional=self._optional,
             parameters=self._parameters,
             mark=mark if state.key in (None, key) else None,
-            now=datetime.fromtimestamp(self._clock.now(), timezone.utc),
+            # What an old key signed is no measure for a new one.
+            now=datetime.fromtimestamp(
+                self._clock.now() if state.key in (None, key) else self._clock.local, timezone.utc
+            ),
         )
-        self._freshness.observe(manifest)
         return manifest, key

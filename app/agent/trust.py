@@ -11,7 +11,6 @@ import base64
 import binascii
 import hashlib
 import json
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,6 +34,7 @@ old with a single manifest.
 MAX_EPOCH_AHEAD = 2**32
 """The same for epochs, with room for those that are a time in seconds."""
 
+MAX_ELEVATION_METRES = 1e6
 MAX_FILES = 100_000
 MAX_VARIABLES = 2000
 MAX_DEPTH = 100
@@ -156,7 +156,7 @@ def parse(data: bytes, signature: str) -> Manifest:
             body.get("closures", "apply"),
             {format_: dict(values) for format_, values in body.get("parameters", {}).items()},
         )
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise Untrusted(f"the server's manifest cannot be read: {type(error).__name__}: {error}") from None
     whole = all(
         type(n) is int and 0 <= n < 2**63
@@ -184,7 +184,11 @@ def read_time(text: str) -> datetime:
         raise ValueError(f"not an RFC 3339 time: {text[:80]!r}")
     fraction = f".{(found['fraction'] + '000000')[:6]}" if found["fraction"] else ""
     zone = "+00:00" if found["zone"] in ("Z", "z") else found["zone"]
-    return datetime.fromisoformat(f"{found['date']}T{found['clock']}{fraction}{zone}")
+    moment = datetime.fromisoformat(f"{found['date']}T{found['clock']}{fraction}{zone}")
+    try:
+        return moment.astimezone(timezone.utc)
+    except OverflowError:
+        raise ValueError(f"a time before year 1 or after 9999: {text[:80]!r}") from None
 
 
 def _check_site(manifest: Manifest) -> None:
@@ -212,7 +216,9 @@ def _is_name(value: object) -> bool:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return -MAX_ELEVATION_METRES <= value <= MAX_ELEVATION_METRES
 
 
 def _is_closure(value: object) -> bool:
