@@ -390,6 +390,7 @@ def test_a_mistake_of_ours_is_told_and_gone_on_from(fake: Fake, robot: Robot, mo
         raise KeyError("x")
 
     monkeypatch.setattr(core, "FIRST_PAUSE_SECONDS", 0.02)
+    fake.close_edges()
     assert robot().once()
     fake.put(B)
     with pytest.MonkeyPatch.context() as patch:
