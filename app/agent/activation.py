@@ -116,6 +116,7 @@ class Activation:
         self._log, self._stopping = log, stopping
         self.retries = retries
         self.pending: Pending | None = None
+        self._replacement: str | None = None
 
     def switch(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
         """Switch to a built version if ``--before-switch`` agrees. The hooks run with ``load``.
@@ -125,6 +126,12 @@ class Activation:
             since: RFC 3339 time from which the version lies ready.
         """
         with self._folder.hooks_lock(self._stopping):
+            problem = level_problem(manifest, read_level(self._folder))
+            if problem is not None and self._folder.manifest(self._store.value.working) is not None:
+                self.pending = None
+                reason = f"version {manifest.version} is refused: {problem}"
+                self.retries.failed(identity(manifest), reason)
+                return Outcome("failed", reason, manifest)
             if self._options.before_switch:
                 self.pending = Pending(name, manifest, since, members)
                 self.protect()
@@ -136,9 +143,28 @@ class Activation:
         self._log("switched", **members)
         return ACTIVE
 
+    def replace(self, name: str, manifest: Manifest, members: Mapping[str, Any], since: str) -> Outcome:
+        """Switch to the current version with other closures and run the hooks; a newer map goes on waiting.
+
+        A failure is tried again ever later, and the robot goes back to the closures that it has loaded.
+        """
+        self._replacement = identity(manifest)
+        if (reason := self.retries.reason(self._replacement)) is not None:
+            return Outcome("waiting", reason, manifest)
+        pending = self.pending
+        try:
+            outcome = self.switch(name, manifest, members, since)
+        finally:
+            if pending is not None:
+                self.pending = pending
+            elif self.pending is not None and self.pending.name == name:
+                self.pending = None
+            self.protect()
+        return self.load() if outcome.state == "active" else outcome
+
     def refusal(self, manifest: Manifest) -> Outcome | None:
         """Return the failure of this very manifest if it is not to be tried again yet."""
-        self.retries.keep_only(identity(manifest), self._folder.standing)
+        self.retries.keep_only(identity(manifest), self._folder.standing, self._replacement)
         reason = self.retries.reason(identity(manifest))
         return None if reason is None else Outcome("failed", reason, manifest)
 
@@ -207,7 +233,8 @@ class Activation:
         self.retries.failed(identity(manifest), reason)
         self._folder.switch(back)
         self._log("restored", version=previous.version, root=previous.root, detail=problem)
-        if (second := self._run_hooks(back, previous)) is not None:
+        is_loaded = self._store.value.activated == back  # no hook of the newer version has run
+        if not is_loaded and (second := self._run_hooks(back, previous)) is not None:
             reason = f"{reason}; nor has it taken version {previous.version} again: {second}"
             self.retries.failed(back, reason)
         return Outcome("failed", reason, manifest)
@@ -218,10 +245,13 @@ class Activation:
         if (problem := level_problem(manifest, level)) is not None:
             return problem
         before = self._folder.manifest(self._store.value.activated)
+        try:
+            variables = self._variables(manifest, before)
+            self._folder.hook_status.unlink(missing_ok=True)
+        except OSError as error:
+            return f"the hooks cannot be run: {error.filename or self._folder.path}: {error.strerror or error}"
         if self._options.on_change:  # cut off in the middle, or taken back: what the robot has loaded is unknown
             self._store.set(activated=None)
-        variables = self._variables(manifest, before)
-        self._folder.hook_status.unlink(missing_ok=True)
         for command in self._options.on_change:
             problem = hooks.run(command, variables, stopping=self._stopping)
             if problem is not None:

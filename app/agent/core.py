@@ -26,9 +26,9 @@ from app.agent.options import Options, robot_name
 from app.agent.requests import parse_requests
 from app.agent.state import State, StateStore
 from app.agent.status import StatusReporter
-from app.agent.trust import Manifest
-from app.agent.web import Busy, ClosuresChanged, Stopped, Web
-from app.errors import FleetMapError, Invalid, NotFound, Untrusted
+from app.agent.trust import File, Manifest
+from app.agent.web import Busy, ClosuresChanged, Stopped, Web, plain
+from app.errors import FleetMapError, Invalid, NotFound, Unavailable, Untrusted
 from app.events import messages
 from app.events.messages import RobotState, RobotStatus
 
@@ -56,6 +56,9 @@ REJOIN_SECONDS = 1.0
 """A fleet that finds its router again does not ask in the same moment: up to so long."""
 
 NO_ROOT = "0" * 64
+
+Subject = Manifest | tuple[int, str]
+"""A map that a status is about: its manifest, or version and root if there is no manifest yet."""
 
 CLOSURE_EVENTS = ("overlay.accepted", "overlay.ended")
 """Events that change the closures in force."""
@@ -114,6 +117,8 @@ class Agent:
         self._told: set[str] = set()
         self._preloaded: Manifest | None = None
         self._preloaded_closures = ""
+        self._fetched: Manifest | None = None
+        self._refreshed: tuple[str, str] | None = None
         self._rejoined = False
         self._in_vain = 0
         self._called = 0
@@ -299,8 +304,8 @@ class Agent:
             try:
                 found = self._web.readyz().get("events", {})
                 told = found.get("connect")
-                connect = connect or (str(told) if told else None)
-                prefix = prefix or str(found.get("prefix") or messages.PREFIX)
+                connect = connect or (plain(str(told)) if told else None)
+                prefix = prefix or plain(str(found.get("prefix") or messages.PREFIX))
             except (FleetMapError, AttributeError):
                 if connect is None or self._ear.aimed:
                     return
@@ -357,6 +362,8 @@ class Agent:
         outcome: Outcome | None = None
         try:
             outcome = self._follow(channel)
+            if outcome.state != "active":
+                self._refresh_closures()
             if outcome.state == "active" and (problem := self._freshness.stale_problem()) is not None:
                 raise Untrusted(problem)
             self._report(outcome, is_planned=planned is not None)
@@ -366,9 +373,8 @@ class Agent:
             self._report_error(error, is_planned=True)
             outcome = Outcome("failed", error.detail)
         self._about = None
-        if plans is not None:
-            self._preload(planned, outcome)
-        return outcome.state == "active"
+        loaded = plans is None or self._preload(planned, outcome)
+        return outcome.state == "active" and loaded
 
     def _write_hooks(self) -> None:
         try:
@@ -383,6 +389,56 @@ class Agent:
         self._about = None
         loaded = self._activation.load()
         return loaded if outcome is None or outcome.state == "active" else outcome
+
+    def _refresh_closures(self) -> None:
+        """Bring the newest closures to the current version while the robot cannot have the channel's one."""
+        name = self._folder.standing
+        current, digest = self._folder.manifest(name), self._manifests.overlays_digest
+        if name is None or current is None or digest is None or self._state.working != name:
+            return
+        if self._manifests.closures_key == current.closures_key or self._refreshed == (name, digest):
+            return
+        keep = self._preloaded.files if self._preloaded else ()
+        try:
+            begun = time.monotonic()
+            manifest, sources = self._fetch_version(current.version, keep)
+            if manifest.root != current.root:
+                raise Untrusted(f"version {manifest.version} has the root {manifest.root[:8]}, not {current.root[:8]}")
+            if manifest.map_key == current.map_key:
+                self._refreshed = (name, digest)  # these closures do not concern this version
+                return
+            members = {
+                "version": manifest.version,
+                "root": manifest.root,
+                "channel": self._state.channel,
+                "sequence": manifest.sequence,
+                "files": len(changed_files(current, manifest)),
+                "seconds": round(time.monotonic() - begun, 3),
+                "detail": "closures of the current version",
+            }
+            built = self._folder.build(manifest, sources)
+            outcome = self._activation.replace(built, manifest, members, self._time_text()[:19] + "Z")
+        except FleetMapError as error:
+            self._tell("failed", detail=f"closures of version {current.version}: {error.detail}")
+            return
+        if outcome.state == "failed":
+            self._tell("failed", detail=outcome.detail)
+
+    def _fetch_version(self, version: int, keep: Sequence[File]) -> tuple[Manifest, dict[str, Path]]:
+        """Fetch a version by its number, again if closures change meanwhile: its manifest, path -> verified file."""
+        for attempt in range(MAX_CLOSURE_CHANGES):
+            manifest = self._manifests.planned(version)
+            self._fetched = manifest
+            try:
+                installed = self._folder.manifest(self._folder.standing)
+                return manifest, self._downloads.fetch(manifest, installed, keep)
+            except (ClosuresChanged, NotFound) as error:
+                if manifest.overlays_digest is None:
+                    raise
+                problem = error.detail
+            if self._stopping.wait(CLOSURES_SECONDS * 2**attempt):
+                raise Stopped
+        raise ClosuresChanged(problem)
 
     def _switch_pending(self) -> bool:
         """Ask ``--before-switch`` again for the map that waits for it."""
@@ -475,6 +531,8 @@ class Agent:
         outcome = self._activation.switch(name, manifest, members, since)
         if outcome.state == "active":
             self._installed(manifest)
+        else:
+            self._folder.tidy(self._preloaded.files if self._preloaded else ())
         return outcome
 
     def _installed(self, manifest: Manifest) -> None:
@@ -500,8 +558,8 @@ class Agent:
         except FleetMapError:
             return None  # the next look tells of it
 
-    def _preload(self, planned: Any, outcome: Outcome) -> None:
-        """Fetch what a channel is planned to move to, so that the switch itself takes no time.
+    def _preload(self, planned: Any, outcome: Outcome) -> bool:
+        """Fetch what a channel is planned to move to, so that the switch itself takes no time: whether it is here.
 
         outcome: of the map that the channel points to now; a failure is part of the status ``ready``.
         """
@@ -510,14 +568,34 @@ class Agent:
             if self._preloaded is not None:
                 self._preloaded = None
                 self._folder.tidy()
-            return
+            return True
         closures = self._manifests.closures_key
         if self._preloaded is None or (self._preloaded.version, self._preloaded_closures) != (version, closures):
-            manifest = self._manifests.planned(version)
-            self._about = manifest
-            self._downloads.fetch(manifest, self._folder.manifest(self._folder.standing), ())
-            self._preloaded, self._preloaded_closures = manifest, closures
+            self._fetched = None
+            try:
+                self._preloaded, _ = self._fetch_version(version, ())
+            except FleetMapError as error:
+                self._report_preload_error(error, version, planned.get("root"))
+                return False
+            self._preloaded_closures = closures
         self._set_status("ready", None if outcome.state == "active" else outcome.detail, self._preloaded)
+        return True
+
+    def _report_preload_error(self, error: FleetMapError, version: int, root: Any) -> None:
+        """Report why a planned version is not here. What may end by itself is no failure of the version."""
+        detail = f"planned version {version}: {error.detail}"
+        subject: Subject | None = self._fetched
+        if subject is None and isinstance(root, str) and trust.is_hash(root):
+            subject = (version, root)
+        if isinstance(error, Busy):
+            self._after = error.seconds
+        if isinstance(error, Unavailable):
+            if subject is not None:
+                self._set_status("downloading", detail, subject)
+        elif subject is None:
+            self._tell_once("failed", detail=detail)  # an older server: which root would fail is not known
+        elif self._set_status("failed", detail, subject):
+            self._tell("refused" if isinstance(error, Untrusted) else "failed", detail=detail)
 
     # --- status ---
 
@@ -559,14 +637,15 @@ class Agent:
         self._reported = what
         self._fail("refused" if isinstance(error, Untrusted) else "failed", error.detail)
 
-    def _set_status(self, state: RobotState, detail: str | None = None, about: Manifest | None = None) -> bool:
+    def _set_status(self, state: RobotState, detail: str | None = None, about: Subject | None = None) -> bool:
         """Note the status and send it: whether it is new. about: the map that it is about; default: the current one."""
         current = self._folder.manifest(self._folder.standing)
-        subject = about or current
-        version, root = (subject.version, subject.root) if subject else (0, NO_ROOT)
+        version, root = _version(about or current)
         channel = self._state.channel or self.options.channel or LATEST
-        sequence, overlays = (current.sequence, current.overlays_digest) if current else (None, None)
-        detail = detail[: messages.MAX_DETAIL] if detail else None
+        overlays = current.overlays_digest if current else None
+        # That of a version fetched by its number is of no move of the channel: the server goes by the root then.
+        sequence = current.sequence if current and current.channel is not None else None
+        detail = plain(detail[: messages.MAX_DETAIL]) if detail else None
         holds = self._loaded(current)
         status = RobotStatus(channel, version, root, state, detail, self._time_text(), sequence, overlays, holds)
         if not self._status.set(status):
@@ -581,7 +660,9 @@ class Agent:
 
         A server that applies no closures does not know this member either.
         """
-        if current is None or current.overlays_digest is None:
+        if current is None:
+            return (0, NO_ROOT) if self._manifests.has_closures else None
+        if current.overlays_digest is None:
             return None
         return (current.version, current.root) if self._state.activated == self._folder.standing else None
 
@@ -597,6 +678,13 @@ class Agent:
         if what not in self._told:
             self._told.add(what)
             self._tell(what, **members)
+
+
+def _version(subject: Subject | None) -> tuple[int, str]:
+    """Return the version and root of a map, those of none if there is none."""
+    if isinstance(subject, Manifest):
+        return subject.version, subject.root
+    return subject or (0, NO_ROOT)
 
 
 def _text(key: bytes) -> str:

@@ -259,7 +259,21 @@ class Folder:
         spared = {self.standing} | {p.relative_to(self.versions).parts[0] for p in needed if self.versions in p.parents}
         old = [name for name in self._names() if name not in spared]
         removable = [name for name in old if name not in self.protected]
-        for name in removable[max(0, kept - len(old) + len(removable)) :]:
+        # Folders that differ in closures alone share a root: they do not push out the version before.
+        roots = {_root_name(name) for name in old if name in self.protected}
+        standing = _root_name(self.standing or "")
+        roots.discard(standing)
+        spare: set[str] = set()
+        for name in removable:
+            root = _root_name(name)
+            if (
+                kept
+                and root not in {_root_name(s) for s in spare}
+                and (root == standing or len(roots | {root}) <= kept)
+            ):
+                spare.add(name)
+                roots |= {root} - {standing}
+        for name in (name for name in removable if name not in spare):
             gone = self.versions / f".{name}"
             shutil.rmtree(gone, ignore_errors=True)
             (self.versions / name).rename(gone)
@@ -291,6 +305,11 @@ class Folder:
             (where / "closures.json", closures_json(manifest)),
             (where / "levels.json", levels_json(manifest)),
         ]
+
+
+def _root_name(name: str) -> str:
+    """Return the part of a folder's name that says version and root."""
+    return "-".join(name.partition(".")[0].split("-")[:2])
 
 
 def _holds(path: Path, file: File) -> bool:
@@ -402,4 +421,4 @@ def levels_json(manifest: Manifest) -> bytes:
 
 
 def _json(body: Mapping[str, Any]) -> bytes:
-    return json.dumps(body, ensure_ascii=False, indent=1).encode() + b"\n"
+    return json.dumps(body, ensure_ascii=False, indent=1).encode("utf-8", "replace") + b"\n"

@@ -11,10 +11,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from app.agent.trust import Manifest
+from app.agent.trust import CLOCKS_DIFFER, Manifest
 
 PLAUSIBLE_SINCE = 1767225600.0
 """2026-01-01: an earlier clock is unset, in seconds since 1970."""
+
+PLAUSIBLE_UNTIL = PLAUSIBLE_SINCE + 10 * 365 * 86400.0
+"""Latest signed time that a robot with an unset clock believes at first contact, in seconds since 1970."""
 
 MAX_AHEAD_SECONDS = 12 * 3600.0
 """Maximum distance of a believed signed time from a plausible clock. Manifests are valid for longer (a day): a server
@@ -47,17 +50,26 @@ class SignedClock:
         """Return the time by which manifests expire."""
         return max(self._clock(), self.floor)
 
-    def observe(self, manifest: Manifest) -> None:
-        """Take the time of a verified manifest into account."""
+    @property
+    def local(self) -> float:
+        """Time of the robot's own clock."""
+        return self._clock()
+
+    def is_plausible(self, manifest: Manifest) -> bool:
+        """Whether the signed time of a manifest is believed; one of an older server has none."""
         if manifest.time is None:
-            return
-        signed, clock = manifest.time.timestamp(), self._clock()
+            return True
+        clock = self._clock()
         if clock >= PLAUSIBLE_SINCE:
             limit = clock + MAX_AHEAD_SECONDS
         else:
-            limit = self.floor + MAX_JUMP_SECONDS if self.floor else signed
-        if signed <= limit:
-            self.floor = max(self.floor, signed)
+            limit = self.floor + MAX_JUMP_SECONDS if self.floor else PLAUSIBLE_UNTIL
+        return manifest.time.timestamp() <= limit
+
+    def observe(self, manifest: Manifest) -> None:
+        """Take the time of a verified manifest into account."""
+        if manifest.time is not None and self.is_plausible(manifest):
+            self.floor = max(self.floor, manifest.time.timestamp())
 
 
 class Freshness:
@@ -66,15 +78,24 @@ class Freshness:
     def __init__(self, poll_seconds: float, time_text: Callable[[], str]) -> None:
         self._stale_after = max(STALE_SECONDS, 3 * poll_seconds)
         self._time_text = time_text
-        self._newest = 0.0
+        self._newest = self._newest_ahead = 0.0
         self._newest_at: tuple[float, str] = (time.monotonic(), time_text())
         self._announced: tuple[int, float, str] | None = None
 
-    def observe(self, manifest: Manifest) -> None:
-        """Note a verified manifest. One of an older server has no time: its expiry moves likewise."""
+    def observe(self, manifest: Manifest, clock: float) -> None:
+        """Note a channel's verified manifest. One of an older server has no time: its expiry moves likewise.
+
+        Times ahead of the robot's clock are compared among themselves: a single one does not outdate all later ones.
+        """
         signed = (manifest.time or manifest.expires).timestamp()
-        if signed > self._newest:
-            self._newest, self._newest_at = signed, (time.monotonic(), self._time_text())
+        is_ahead = signed > clock + CLOCKS_DIFFER.total_seconds()
+        if signed <= (self._newest_ahead if is_ahead else self._newest):
+            return
+        if is_ahead:
+            self._newest_ahead = signed
+        else:
+            self._newest = signed
+        self._newest_at = (time.monotonic(), self._time_text())
 
     def stale_problem(self) -> str | None:
         """Return why the server counts as frozen, None if it does not."""

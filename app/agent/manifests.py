@@ -37,6 +37,7 @@ class Manifests:
         count = len(options.formats)
         self._required = [request.name for request in requests[:count]]
         self._optional = [request.name for request in requests[count:]]
+        self._parameters = {request.name: dict(request.parameters) for request in requests if request.parameters}
         self._query = f"formats={encode_entries(requests[:count])}"
         if options.optional:
             self._query += f"&optional={encode_entries(requests[count:])}"
@@ -63,6 +64,8 @@ class Manifests:
         if found is None:
             return cached if cached is not None and accept(cached) else None
         manifest, key = self._verify(found[0], found[1], channel, mark)
+        if self._clock.is_plausible(manifest):
+            self._freshness.observe(manifest, self._clock.local)
         if not accept(manifest):
             return None
         if state.key is not None and state.key != key:  # endorsed: what an old key signed is no measure any more
@@ -80,6 +83,8 @@ class Manifests:
         """Fetch the manifest of a version that a channel is planned to move to. Raises Untrusted."""
         closures = "&closures=apply" if self.has_closures else ""
         found = self._web.manifest(self._options.environment, str(version), self._query + closures)
+        if found is not None and not closures and trust.parse(found[0], found[1]).overlays_digest is not None:
+            found = self._web.manifest(self._options.environment, str(version), f"{self._query}&closures=apply")
         if found is None:
             raise Unavailable(f"the server did not return the manifest of version {version}")
         manifest, _ = self._verify(found[0], found[1], None, None)
@@ -97,6 +102,11 @@ class Manifests:
     def closures_key(self) -> str:
         """Digest of the closures in the newest manifest, empty if there are none."""
         return self._latest[2].closures_key if self._latest else ""
+
+    @property
+    def overlays_digest(self) -> str | None:
+        """Digest of the closures of the newest manifest, None if there is none or the server applies none."""
+        return self._latest[2].overlays_digest if self._latest else None
 
     @property
     def has_closures(self) -> bool:
@@ -122,8 +132,11 @@ class Manifests:
             channel=channel,
             formats=self._required,
             optional=self._optional,
+            parameters=self._parameters,
             mark=mark if state.key in (None, key) else None,
-            now=datetime.fromtimestamp(self._clock.now(), timezone.utc),
+            # What an old key signed is no measure for a new one.
+            now=datetime.fromtimestamp(
+                self._clock.now() if state.key in (None, key) else self._clock.local, timezone.utc
+            ),
         )
-        self._freshness.observe(manifest)
         return manifest, key

@@ -10,7 +10,6 @@ import dataclasses
 import errno
 import hashlib
 import json
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -20,6 +19,9 @@ from typing import Any, NamedTuple
 from app.errors import Invalid
 
 HASH_BYTES = 1 << 18
+
+MAX_TIME = 253402214400.0
+"""9999-12-31, in seconds since 1970."""
 
 FORM = 2
 """Format of state.json. Form 1, of releases without epochs, is read as well."""
@@ -31,6 +33,7 @@ class Mark(NamedTuple):
     epoch: int
     sequence: int
     root: str
+    overlays_digest: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +77,9 @@ def load(path: Path, environment: str) -> State:
             given=body.get("given"),
             channel=body.get("channel"),
             marks={
-                str(c): Mark(int(m.get("epoch", 0)), int(m["sequence"]), str(m["root"]))
+                str(c): Mark(
+                    int(m.get("epoch", 0)), int(m["sequence"]), str(m["root"]), _text(m.get("overlays_digest"))
+                )
                 for c, m in body["marks"].items()
             },
             etag=body.get("etag"),
@@ -84,8 +89,8 @@ def load(path: Path, environment: str) -> State:
             working=_name(body["working"] if "working" in body else body.get("activated")),
             newest_time=float(body.get("newest_time", 0)),
         )
-        if not math.isfinite(found.newest_time):
-            raise ValueError("newest_time is not a finite number")
+        if not 0 <= found.newest_time <= MAX_TIME:
+            raise ValueError("newest_time is not a time")
     except FileNotFoundError:
         return State(environment)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
@@ -114,6 +119,10 @@ def save(path: Path, state: State) -> None:
         "newest_time": state.newest_time,
     }
     write_whole(path, json.dumps(body, indent=1).encode() + b"\n")
+
+
+def _text(value: Any) -> str | None:
+    return None if value is None else str(value)
 
 
 def _name(value: Any) -> str | None:

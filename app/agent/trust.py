@@ -11,7 +11,6 @@ import base64
 import binascii
 import hashlib
 import json
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,6 +34,7 @@ old with a single manifest.
 MAX_EPOCH_AHEAD = 2**32
 """The same for epochs, with room for those that are a time in seconds."""
 
+MAX_ELEVATION_METRES = 1e6
 MAX_FILES = 100_000
 MAX_VARIABLES = 2000
 MAX_DEPTH = 100
@@ -84,6 +84,7 @@ class Manifest:
     variables: what the place is called (``FARM_NAME`` …), for who sources ``environment.sh``. layers: layer -> a hash
     of its content. time: when it was signed. levels: lowest first. missing: optional format -> why it cannot be given.
     overlays: closures in force, as the server lists them; overlays_digest is None if the server applies none.
+    closures, parameters: of the request that it answers: how closures are shown, and format -> its parameters.
     """
 
     environment: str
@@ -103,11 +104,13 @@ class Manifest:
     missing: Mapping[str, str] = field(default_factory=dict)
     overlays: tuple[Mapping[str, Any], ...] = ()
     overlays_digest: str | None = None
+    closures: str = "apply"
+    parameters: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     @property
     def mark(self) -> Mark:
         """Its position in the channel's history."""
-        return Mark(self.epoch, self.sequence, self.root)
+        return Mark(self.epoch, self.sequence, self.root, self.overlays_digest)
 
     @property
     def map_key(self) -> tuple[Any, ...]:
@@ -150,8 +153,10 @@ def parse(data: bytes, signature: str) -> Manifest:
             {line["format"]: line["detail"] for line in body.get("missing", [])},
             tuple(body.get("overlays", [])),
             body.get("overlays_digest"),
+            body.get("closures", "apply"),
+            {format_: dict(values) for format_, values in body.get("parameters", {}).items()},
         )
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise Untrusted(f"the server's manifest cannot be read: {type(error).__name__}: {error}") from None
     whole = all(
         type(n) is int and 0 <= n < 2**63
@@ -179,7 +184,11 @@ def read_time(text: str) -> datetime:
         raise ValueError(f"not an RFC 3339 time: {text[:80]!r}")
     fraction = f".{(found['fraction'] + '000000')[:6]}" if found["fraction"] else ""
     zone = "+00:00" if found["zone"] in ("Z", "z") else found["zone"]
-    return datetime.fromisoformat(f"{found['date']}T{found['clock']}{fraction}{zone}")
+    moment = datetime.fromisoformat(f"{found['date']}T{found['clock']}{fraction}{zone}")
+    try:
+        return moment.astimezone(timezone.utc)
+    except OverflowError:
+        raise ValueError(f"a time before year 1 or after 9999: {text[:80]!r}") from None
 
 
 def _check_site(manifest: Manifest) -> None:
@@ -195,6 +204,7 @@ def _check_site(manifest: Manifest) -> None:
         (not all(_is_closure(closure) for closure in manifest.overlays), "a closure has no id"),
         (bool(manifest.overlays) and manifest.overlays_digest is None, "its closures have no digest"),
         (not _is_digest(manifest.overlays_digest), "the digest of its closures is invalid"),
+        (not isinstance(manifest.closures, str), "how it shows closures is not a text"),
     )
     for is_wrong, problem in problems:
         if is_wrong:
@@ -206,7 +216,9 @@ def _is_name(value: object) -> bool:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    return -MAX_ELEVATION_METRES <= value <= MAX_ELEVATION_METRES
 
 
 def _is_closure(value: object) -> bool:
@@ -214,7 +226,12 @@ def _is_closure(value: object) -> bool:
 
 
 def _is_digest(value: object) -> bool:
-    return value is None or (isinstance(value, str) and _HASH.fullmatch(value) is not None)
+    return value is None or (isinstance(value, str) and is_hash(value))
+
+
+def is_hash(text: str) -> bool:
+    """Whether a text is a SHA-256 in hexadecimal digits."""
+    return _HASH.fullmatch(text) is not None
 
 
 def _check_variables(variables: Mapping[str, str]) -> None:
@@ -320,10 +337,13 @@ def check(
     channel: str | None,
     formats: Sequence[str],
     optional: Sequence[str] = (),
+    parameters: Mapping[str, Mapping[str, str]] | None = None,
     mark: Mark | None,
     now: datetime | None = None,
 ) -> None:
     """Whether a signed manifest is the one that was asked for. mark: that of the newest one ever believed.
+
+    parameters: format -> the parameters that it was requested with, of formats that have any.
 
     Raises Untrusted, with what an operator can do.
     """
@@ -344,6 +364,7 @@ def check(
     if not set(formats) <= got <= {*formats, *optional}:
         missing, more = sorted(set(formats) - got), sorted(got - set(formats) - set(optional))
         raise Untrusted(f"the manifest is of other formats: without {missing or 'none'}, with {more or 'no'} further")
+    _check_request(manifest, parameters or {}, optional)
     _check_ahead(manifest, mark)
     if mark is None:
         return
@@ -358,6 +379,30 @@ def check(
             f"the manifest of sequence {manifest.sequence} has the root {manifest.root[:8]}, and {mark.root[:8]} was "
             "seen under the same number: two servers use one key, or it was restored: raise its epoch"
         )
+    old, new = mark.overlays_digest, manifest.overlays_digest
+    if (manifest.epoch, manifest.sequence) == (mark.epoch, mark.sequence) and old not in (None, new):
+        raise Untrusted(
+            f"the manifest of sequence {manifest.sequence} has the closures {(new or 'none')[:8]}, and "
+            f"{(old or 'none')[:8]} was seen under the same number: there are two servers with one key. If it was "
+            "restored, remove state.json"
+        )
+
+
+def _check_request(manifest: Manifest, parameters: Mapping[str, Mapping[str, str]], optional: Sequence[str]) -> None:
+    """Refuse the answer to a request that was changed on its way. Servers without closures do not sign requests."""
+    if manifest.overlays_digest is None:
+        return
+    present = {file.format for file in manifest.files}
+    silent = [name for name in optional if name not in present and name not in manifest.missing]
+    if manifest.closures != "apply":
+        problem = f"closures={manifest.closures[:80]} instead of apply"
+    elif manifest.parameters != parameters:
+        problem = f"the parameters {str(manifest.parameters)[:300]} instead of {str(parameters)[:300]}"
+    elif silent:
+        problem = f"without the optional {', '.join(silent)[:300]}, and without a reason"
+    else:
+        return
+    raise Untrusted(f"the manifest answers another request ({problem}): check what is between the robot and the server")
 
 
 def _check_ahead(manifest: Manifest, mark: Mark | None) -> None:

@@ -365,7 +365,7 @@ class Web:
             if state not in ("queued", "running"):
                 problem = job.get("problem") if isinstance(job, dict) else None
                 detail = problem.get("detail") if isinstance(problem, dict) else state
-                raise Invalid(f"the server cannot make the maps: {detail}")
+                raise Invalid(f"the server cannot make the maps: {plain(str(detail)[:1000])}")
             if waited > JOB_SECONDS:
                 raise Unavailable(f"the server has not made the maps within {JOB_SECONDS:g} seconds")
             if self._stopping.wait(pause):
@@ -412,7 +412,7 @@ class Web:
             detail = str(problem.get("detail") or problem.get("title") or "") if isinstance(problem, dict) else ""
         except (ValueError, RecursionError, httpx.HTTPError, FleetMapError):
             detail = ""
-        detail = detail[:1000] or f"{self.server} answered {status}"
+        detail = plain(detail[:1000]) or f"{self.server} answered {status}"
         if 300 <= status < 400 and (elsewhere := answer.headers.get("location")):
             detail = f"{self.server} sends to {elsewhere[:300]}: if the server has moved, name it so with --server"
         if status in (429, 503):
@@ -426,6 +426,11 @@ class Web:
         if status == 404:
             return NotFound(detail)
         return Unavailable(detail) if status >= 500 else Invalid(detail)
+
+
+def plain(text: str) -> str:
+    """Replace what UTF-8 cannot encode: JSON of a server may hold half a surrogate pair."""
+    return text.encode("utf-8", "replace").decode()
 
 
 def _complete(part: Path, file: File) -> bool:

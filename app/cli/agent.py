@@ -208,17 +208,18 @@ def _logger(*, as_json: bool) -> Callable[..., None]:
 
     def log(event: str, **members: Any) -> None:
         # A log on a full disk, or nobody who reads (where rich would exit): the map is kept all the same.
-        with contextlib.suppress(OSError, SystemExit):
+        with contextlib.suppress(OSError, SystemExit, UnicodeError):
             print_line(event, members)
 
     def print_line(event: str, members: dict[str, Any]) -> None:
         if as_json:
             time = datetime.now(timezone.utc).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-            sys.stdout.write(json.dumps({"time": time, "event": event, **members}, ensure_ascii=False) + "\n")
+            line = json.dumps({"time": time, "event": event, **members}, ensure_ascii=False)
+            sys.stdout.write(line.encode("utf-8", "replace").decode() + "\n")
             sys.stdout.flush()
         else:
             style = "red" if event in ("failed", "refused", "damaged") else None
-            output.say(f"{event}: {_line(members)}", style=style)
+            output.say(f"{event}: {_line(members)}".encode("utf-8", "replace").decode(), style=style)
 
     return log
 

@@ -13,6 +13,7 @@ from datetime import datetime, timedelta, timezone
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qsl, unquote
 
 from app.agent.core import Agent, Options
 from app.signing import Keys
@@ -101,10 +102,16 @@ class Fake:
     def digest(self) -> str:
         return hashlib.sha256(json.dumps(self.closures or []).encode()).hexdigest()
 
+    def root(self, version: int) -> str:
+        return hashlib.sha256(repr(sorted(self.versions[version - 1].items())).encode()).hexdigest()
+
+    def plan(self, channel: str, version: int) -> None:
+        self.planned[channel] = {"version": version, "root": self.root(version)}
+
     def file(self, path: str, version: int) -> bytes:
         return self.versions[version - 1][path] + "".join(c["id"] for c in self.closures or []).encode()
 
-    def manifest(self, ref: str) -> bytes:
+    def manifest(self, ref: str, query: str = "") -> bytes:
         number, sequence = (int(ref), 1) if ref.isdigit() else self.channels[ref]
         originals = self.versions[number - 1]
         files = {path: self.file(path, number) for path in originals}
@@ -113,7 +120,7 @@ class Fake:
             **({} if ref.isdigit() else {"channel": ref}),
             "sequence": sequence,
             "version": number,
-            "root": hashlib.sha256(repr(sorted(originals.items())).encode()).hexdigest(),
+            "root": self.root(number),
             "expires": (datetime.now(timezone.utc) + timedelta(days=1)).isoformat(),
             "files": [
                 {
@@ -128,7 +135,7 @@ class Fake:
             "layers": {"topology": hashlib.sha256(repr(sorted(originals.items())).encode()).hexdigest()[:16]},
         }
         if self.closures is not None:
-            body |= {"overlays": self.closures, "overlays_digest": self.digest}
+            body |= {"overlays": self.closures, "overlays_digest": self.digest, **self.request(ref, query)}
         if self.levels:
             names = sorted(set(self.levels.values()))
             body["levels"] = [{"name": name, "elevation": 3.5 * k} for k, name in enumerate(names)]
@@ -136,9 +143,19 @@ class Fake:
             body["time"] = datetime.now(timezone.utc).isoformat()
         return json.dumps(body | self.more).encode()
 
+    def request(self, ref: str, query: str) -> dict[str, Any]:
+        """What a manifest says of the request that it answers."""
+        values = dict(parse_qsl(query))
+        entries = [unquote(e).partition("?") for e in values.get("formats", "").split(",")]
+        entries += [unquote(e).partition("?") for e in values.get("optional", "").split(",") if e]
+        parameters = {name: dict(parse_qsl(text)) for name, _, text in entries if text}
+        mode = values.get("closures", "ignore" if ref.isdigit() else "apply")
+        return ({"parameters": parameters} if parameters else {}) | ({} if mode == "apply" else {"closures": mode})
+
     def answer(self, handler: BaseHTTPRequestHandler) -> None:
         """As a server does."""
-        path = handler.path.partition("?")[0].split("/")
+        address, _, query = handler.path.partition("?")
+        path = address.split("/")
         if path[-1] == "readyz":
             return send(handler, 200, json.dumps({"events": self.ready}).encode())
         if path[-1] == "keys":
@@ -151,8 +168,8 @@ class Fake:
         if path[-1] == "manifest":
             if not path[-2].isdigit() and path[-2] not in self.channels:
                 return send(handler, 404, b'{"detail": "no such channel"}')
-            data = self.manifest(path[-2])
-            etag = f'"{hashlib.sha256(data.partition(b"expires")[0]).hexdigest()}"'
+            data = self.manifest(path[-2], query)
+            etag = f'"{hashlib.sha256(data.partition(b"expires")[0] + self.digest.encode()).hexdigest()}"'
             if handler.headers.get("if-none-match") == etag:
                 return send(handler, 304, b"", etag=etag)
             key, signature = self.keys.sign(data)

@@ -222,3 +222,163 @@ def test_status_carries_the_digest() -> None:
     status = RobotStatus.from_dict(body)
     assert status.overlays == "1" * 64
     assert status.as_dict() == body
+
+
+@pytest.mark.parametrize("ref", ["latest", "2"])
+@pytest.mark.parametrize(
+    ("members", "text"),
+    [
+        ({"closures": "ignore"}, "closures=ignore instead of apply"),
+        ({"closures": "mark"}, "closures=mark instead of apply"),
+        ({"parameters": {"kml": {"level": "L2"}}}, "'level': 'L2'"),
+        ({"parameters": {}}, "'crs': 'local'"),
+        ({"missing": []}, "without the optional osm"),
+        ({"closures": 7}, "cannot be read"),
+    ],
+)
+def test_manifest_of_another_request_is_refused(
+    fake: Fake, robot: Robot, members: dict[str, Any], text: str, ref: str
+) -> None:
+    fake.more = {"parameters": {"kml": {"crs": "local"}}, "missing": [{"format": "osm", "detail": "no network"}]}
+    more = {"formats": ("kml?crs=local",), "optional": ("osm",)}
+    assert robot(**more).once()
+    fake.put(B)
+    honest, fake.more = fake.more, fake.more | members
+    if ref == "2":
+        fake.move("production", 1)
+        fake.move("production", 1)
+        fake.plan("production", 2)
+        more["channel"] = "production"
+        fake.more, lie = honest, fake.more
+
+        def change(handler: BaseHTTPRequestHandler) -> bool:
+            fake.more = lie if "/versions/2/manifest" in handler.path else honest
+            return False
+
+        fake.instead = change
+    one = robot(**more)
+    assert not one.once()
+    assert text in one.detail
+    assert whole(one.into)["version"] == 1
+    assert (fake.statuses[-1]["state"], fake.statuses[-1]["version"]) == ("failed", 1 if ref == "latest" else 2)
+    fake.more, fake.instead = honest, lambda _: False
+    assert robot(**more).once()
+
+
+def test_request_is_not_checked_if_the_server_applies_no_closures(fake: Fake, robot: Robot) -> None:
+    fake.closures = None
+    assert robot(formats=("kml?crs=local",), optional=("osm",)).once()
+
+
+def test_other_closures_under_one_sequence_are_refused(fake: Fake, robot: Robot) -> None:
+    fake.close_edges("e7")
+    assert robot().once()
+    fake.closures = []
+    one = robot()
+    assert not one.once()
+    assert "under the same number" in one.detail
+    assert held(one)[0].endswith(b"ae7")
+    fake.close_edges()
+    assert robot().once()
+
+
+def test_first_digest_under_one_sequence_is_accepted(fake: Fake, robot: Robot) -> None:
+    assert robot().once()
+    path = robot().into / "state.json"
+    state = json.loads(path.read_text())
+    assert state["marks"]["latest"].pop("overlays_digest") == fake.digest
+    path.write_text(json.dumps(state))
+    fake.more = {"extra": 1}
+    assert robot().once()
+    assert json.loads(path.read_text())["marks"]["latest"]["overlays_digest"] == fake.digest
+
+
+def closed(one: One) -> list[str]:
+    """Edges that are closed in what the robot drives by."""
+    return [closure["edge"] for closure in held(one)[1]["closures"]]
+
+
+def test_closure_reaches_a_robot_whose_hook_fails_for_the_newer_version(
+    fake: Fake, robot: Robot, tmp_path: Path
+) -> None:
+    hook = f"test $FLEETMAP_VERSION = 1 && cp $FLEETMAP_CURRENT/kml/map.kml {tmp_path}/taken"
+    assert robot(hook).once()
+    fake.put(B)
+    assert not robot(hook).once()
+    fake.close_edges("e7")
+    one = robot(hook)
+    assert not one.once()
+    assert (closed(one), whole(one.into)["version"]) == (["e7"], 1)
+    assert (tmp_path / "taken").read_bytes().endswith(b"ae7")
+    state = json.loads((one.into / "state.json").read_text())
+    assert state["working"] == state["activated"] == (one.into / "current").readlink().name
+    last = fake.statuses[-1]
+    assert (last["state"], last["version"], last["overlays"]) == ("failed", 2, fake.digest)
+    assert "sequence" not in last, "that of the closure would say that the robot has acted on the move to 2"
+    assert last["holds"]["version"] == 1
+    fake.asked.clear()
+    assert not robot(hook).once()
+    assert not [path for path in fake.asked if "/versions/1/" in path], "once for each change"
+    fake.close_edges()
+    one = robot(hook)
+    assert not one.once()
+    assert closed(one) == []
+    assert robot().once()
+    assert whole(one.into)["version"] == 2
+
+
+@pytest.mark.parametrize("status", ["75", "1"])
+def test_closure_reaches_a_robot_that_waits_or_refused(fake: Fake, robot: Robot, status: str) -> None:
+    assert robot().once()
+    fake.put(B)
+    one = robot("true", before_switch=(f"test $FLEETMAP_VERSION = 1 || exit {status}",), poll_seconds=0.2)
+    with run(one):
+        eventually(lambda: fake.statuses[-1]["version"] == 2)
+        fake.close_edges("e7")
+        eventually(lambda: fake.statuses[-1].get("overlays") == fake.digest)
+        assert (closed(one), whole(one.into)["version"]) == (["e7"], 1)
+        assert one.agent._activation.is_waiting() == (status == "75")
+        fake.close_edges()
+        eventually(lambda: fake.statuses[-1].get("overlays") == fake.digest)
+        assert closed(one) == []
+
+
+def test_closure_that_the_robot_cannot_load_is_tried_again_ever_later(fake: Fake, robot: Robot, tmp_path: Path) -> None:
+    assert robot().once()
+    fake.put(B)
+    loads = "test $FLEETMAP_VERSION = 1 && ! grep -q e7 $FLEETMAP_CLOSURES_FILE"
+    hook = f"cat $FLEETMAP_CLOSURES_FILE >> {tmp_path}/log; {loads}"
+    one = robot(hook, poll_seconds=0.2)
+    one.agent._retries._first = lambda: 1000.0
+    one.agent._retries._longest = 1000.0
+    with run(one):
+        eventually(lambda: one.saw("failed"))
+        fake.close_edges("e7")
+        eventually(lambda: (tmp_path / "log").read_text().count("e7") >= 2)
+        time.sleep(1.5)
+    assert closed(one) == []
+    assert (tmp_path / "log").read_text().count('"id": "e7"') == 2, "version 2 and version 1, once each"
+
+
+def test_closures_that_change_during_a_preload_are_no_failure(
+    fake: Fake, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(core, "CLOSURES_SECONDS", 0.01)
+    fake.move("production", 1)
+    assert robot().once()
+    fake.put(B)
+    fake.planned["production"] = {"version": 2}
+    changes = 3
+
+    def change(handler: BaseHTTPRequestHandler) -> bool:
+        nonlocal changes
+        if "/versions/2/maps/" in handler.path and changes:
+            changes -= 1
+            fake.close_edges(f"e{changes}")
+        return False
+
+    fake.instead = change
+    fake.statuses.clear()
+    assert robot().once()
+    assert changes == 0
+    assert [(s["state"], s["version"]) for s in fake.statuses] == [("active", 1), ("ready", 2)]

@@ -317,3 +317,36 @@ def test_kill_at_random_moments_of_hooks_ends_consistently(fake: Fake, tmp_path:
     fake.put(C)
     assert One(fake, into, hook).once()
     assert taken.read_bytes() == C["kml/map.kml"]
+
+
+@pytest.mark.parametrize(("status", "reported"), [(409, "failed"), (404, "failed"), (503, "downloading")])
+def test_planned_version_that_cannot_be_given_is_reported_once(
+    fake: Fake, robot: Robot, status: int, reported: str
+) -> None:
+    fake.move("production", 1)
+    assert robot().once()
+    fake.put(B)
+    fake.plan("production", 2)
+    detail = b'{"detail": "no kml of this version"}'
+    fake.instead = lambda h: "/versions/2/manifest" in h.path and (send(h, status, detail) or True)
+    fake.statuses.clear()
+    one = robot(poll_seconds=0.05)
+    with run(one):
+        eventually(lambda: sum("/versions/2/manifest" in path for path in fake.asked) >= 4)
+        states = [(s["state"], s["version"], s["root"]) for s in fake.statuses]
+        assert states == [("active", 1, fake.root(1)), (reported, 2, fake.root(2))]
+        assert "no kml of this version" in fake.statuses[-1]["detail"]
+        fake.instead = lambda _: False
+        eventually(lambda: fake.statuses[-1]["state"] == "ready")
+
+
+def test_server_that_is_busy_during_a_preload_is_no_failure_of_the_version(fake: Fake, robot: Robot) -> None:
+    fake.move("production", 1)
+    assert robot().once()
+    fake.put(B)
+    fake.plan("production", 2)
+    fake.instead = lambda h: "/versions/2/maps/" in h.path and (send(h, 500, b"{}") or True)
+    assert not robot().once()
+    last = fake.statuses[-1]
+    assert (last["state"], last["version"]) == ("downloading", 2)
+    assert "answered 500" in last["detail"]
