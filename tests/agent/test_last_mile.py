@@ -83,7 +83,7 @@ def test_accepted_report_stops_a_robot_and_frees_it_at_its_end(
     """A robot reports an edge, an editor accepts with one call; nobody calls anything when the time is over."""
     name = site("office")
     topology = api.get(f"environments/{name}/versions/production/layers/topology?crs=local").json()["features"]
-    on_level = [f for f in topology if (f["properties"]["level"] == "ground") == (level == "ground")]
+    on_level = [f for f in topology if (f["level"] == "ground") == (level == "ground")]
     edge = next(f for f in on_level if f["properties"].get("kind") == "edge" and f.get("place"))
     one = robot(env=name, formats=EVERYTHING, name=f"rover-{level}")
     one.wait("active", 120)
