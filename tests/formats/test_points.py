@@ -218,21 +218,24 @@ def test_memory_of_a_large_text() -> None:
         assert peak < 10 * len(data), f"{to} {options}: {peak / len(data):.1f} times the text"
 
 
-def test_a_million_points_take_less_than_half_a_second() -> None:
+def test_a_million_points_cost_no_more_than_sorting_them() -> None:
     n = 1_000_000
     dice = np.random.default_rng(5)
     body = dice.uniform(-50, 50, (n, 3)).astype("<f4").tobytes()
     head = f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {n}\nHEIGHT 1\nDATA binary\n".encode()
-    best = 9.0
-    for _ in range(3):
-        start = time.process_time()  # one thread: what it takes on a machine that has nothing else to do
+    ours = floor = 9.0
+    for _ in range(3):  # both in turn, by the processor's time, so that a busy machine slows both
+        start = time.process_time()
         layers = layers_of("map.pcd", head + body)
-        best = min(best, time.process_time() - start)
+        ours = min(ours, time.process_time() - start)
+        start = time.process_time()
+        places = np.floor(np.frombuffer(body, "<f4").astype(float) * (1 / 0.05)).astype(np.int64).reshape(-1, 3)
+        codes = np.unique(morton(*places.T))
+        floor = min(floor, time.process_time() - start)
     voxels = layers.parts[PartKey("voxels")]
     assert isinstance(voxels, VoxelMap)
-    places = np.floor(np.frombuffer(body, "<f4").astype(float) * (1 / 0.05)).astype(np.int64).reshape(-1, 3)
-    assert np.array_equal(voxels.code, np.unique(morton(*places.T)))
-    assert best < 0.5, f"{best:.2f} s"
+    assert np.array_equal(voxels.code, codes)
+    assert ours < 1.5 * floor, f"{ours:.2f} s, and the sort alone {floor:.2f} s"
 
 
 def test_colours_are_means() -> None:
