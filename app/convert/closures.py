@@ -337,9 +337,9 @@ def _close_edges(
     loose = {part.properties[k].get("drawn_from") for k in until} - {None}
     properties = []
     for k, p in enumerate(part.properties):
-        if p.get("drawn_from") in loose:
-            p = {name: value for name, value in p.items() if name != "drawn_from"}  # noqa: PLW2901
-        properties.append({**p, BLOCKED: True, UNTIL: until[k]} if k in until else p)
+        cut = ("drawn_from",) if p.get("drawn_from") in loose else ()
+        added: dict[str, Any] = {BLOCKED: True, UNTIL: until[k]} if k in until else {}
+        properties.append({name: value for name, value in p.items() if name not in cut} | added)
     return replace(part, properties=tuple(properties))
 
 

@@ -189,12 +189,7 @@ class Maps:
 
         Raises what ``recipe`` and ``make`` do; NotFound where the map has no such file.
         """
-        while True:
-            recipe = self.recipe(version, name, values, derive=derive, file=file)
-            try:
-                return file_of(recipe, self.ready(recipe) or self.make(recipe), file)
-            except CannotDerive:
-                continue  # it is remembered: the next recipe goes another way, or says that there is none
+        return file_of(*self._by_any_chain(version, name, values, derive=derive, file=file), file)
 
     def at_once(
         self,
@@ -206,10 +201,16 @@ class Maps:
         file: str | None = None,
     ) -> Made:
         """The map, by whichever way works; blocks until it is made. Raises what ``recipe`` and ``make`` do."""
+        return self._by_any_chain(version, name, values, derive=derive, file=file)[1]
+
+    def _by_any_chain(
+        self, version: Version, name: str, values: Mapping[str, str] | None, *, derive: bool, file: str | None
+    ) -> tuple[Recipe, Made]:
+        """The first recipe whose derivations find something to use, and its map."""
         while True:
             recipe = self.recipe(version, name, values, derive=derive, file=file)
             try:
-                return self.ready(recipe) or self.make(recipe)
+                return recipe, self.ready(recipe) or self.make(recipe)
             except CannotDerive:
                 continue  # it is remembered: the next recipe goes another way, or says that there is none
 
