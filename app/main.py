@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import fcntl
+import importlib
 import logging
 import os
 import shutil
 import sys
+import threading
 from collections.abc import AsyncIterator, Iterator
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -91,7 +93,8 @@ COLLECT_EVERY = timedelta(hours=24)
 COLLECT_GRACE = timedelta(hours=6)
 """Data that nothing refers to is removed once a day, unless it is younger than this (an upload may be using it)."""
 
-WARM = ("app.ingest.prepare", "app.convert.make", "app.convert.files")
+WARM = ("app.ingest.prepare", "app.convert.warm")
+"""What worker processes need, and the server for its first coverage table."""
 
 
 def create_app(settings: Settings) -> Server:
@@ -103,6 +106,7 @@ def create_app(settings: Settings) -> Server:
         app.state.services = here
         app.state.feed = events.Feed(here)
         here.fleet.start()
+        threading.Thread(target=_prepare, args=(here,), daemon=True).start()
         publishing = [p for p in (ros2_of(settings, here), relay_of(settings, here)) if p is not None]
         app.hot = here.hot
         ticker = asyncio.create_task(_tick(here))
@@ -399,6 +403,14 @@ def close_services(here: Services) -> None:
     here.work.close()
     here.intake.close()
     here.store.close()
+
+
+def _prepare(here: Services) -> None:
+    """Do beside the start what the first request would wait for."""
+    here.pool.start()
+    for name in WARM:
+        importlib.import_module(name)
+    here.prepared.set()
 
 
 @contextlib.contextmanager

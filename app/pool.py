@@ -1,7 +1,8 @@
 """A pool of worker processes for parsing and conversion: limits on memory and time, and a crash costs one job.
 
-Hostile files are read here, never in the server's own process (security, reading 1). Workers are spawned, since the
-server holds native threads; a worker that dies or overruns is replaced, and workers end with their parent.
+Hostile files are read here, never in the server's own process (security, reading 1). Workers are forked from a process
+that has imported what they need and does nothing else: a worker that dies or overruns is replaced within milliseconds,
+and all share that memory. The server itself is never forked, since it holds native threads. Workers end with it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import os
 import queue
 import resource
 import threading
-import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ from app.sandbox import Allowed, confine
 
 log = logging.getLogger(__name__)
 
-_spawn = multiprocessing.get_context("spawn")
+_processes = multiprocessing.get_context("forkserver")
 
 LOOK_SECONDS = 0.2
 """How often a job in line looks whether it is still wanted."""
@@ -98,14 +98,24 @@ class Pool:
         self._lock = threading.Lock()
         self._closed = False
         for _ in range(workers):
-            self._idle.put(None)  # started when first needed, or by start()
+            self._idle.put(None)  # started when first needed
         self._count = workers
+        if warm:
+            _processes.set_forkserver_preload(list(warm))
 
     def start(self) -> None:
-        """Start all workers now, so that the first job does not pay for their imports."""
-        taken = [self._idle.get() for _ in range(self._count)]
-        for worker in taken:
-            self._idle.put(worker or self._new())
+        """Start all workers now, so that the first job does not pay for their imports; blocks until they are there.
+
+        Where one cannot be started, that is tried again when it is needed.
+        """
+        for taken in [self._idle.get() for _ in range(self._count)]:
+            worker = taken
+            try:
+                worker = taken or self._new()
+            except FleetMapError as error:
+                log.warning("a worker could not be started: %s", error.detail)
+            finally:
+                self._idle.put(worker)
 
     def run(
         self, function: Callable[..., Any], *args: Any, seconds: float | None = None, stop: Stop | None = None
@@ -171,14 +181,14 @@ class Pool:
 
     def _new(self) -> _Worker:
         try:
-            ours, theirs = _spawn.Pipe()
+            ours, theirs = _processes.Pipe()
         except OSError as error:
             raise Unavailable("the system lets no further file be opened: try again in a few seconds") from error
-        arguments = (theirs, os.getpid(), self._memory_bytes, self._warm, self._allowed)
-        process = _spawn.Process(target=_work, args=arguments, daemon=True, name="fleetmap-worker")
+        arguments = (theirs, dict(os.environ), self._memory_bytes, self._warm, self._allowed)
+        process = _processes.Process(target=_work, args=arguments, daemon=True, name="fleetmap-worker")
         try:
             process.start()
-        except OSError as error:
+        except (OSError, EOFError) as error:  # EOFError: what it was to be forked from has ended; it is started anew
             ours.close()
             raise Unavailable("the system lets no further process start: try again in a few seconds") from error
         finally:
@@ -216,14 +226,18 @@ def _ask(worker: _Worker, function: Callable[..., Any], args: tuple[Any, ...], s
     return ok, value
 
 
-def _work(pipe: Connection, parent: int, memory_bytes: int, warm: tuple[str, ...], allowed: Allowed | None) -> None:
+def _work(
+    pipe: Connection, environment: dict[str, str], memory_bytes: int, warm: tuple[str, ...], allowed: Allowed | None
+) -> None:
     """A worker's life: take a job, answer, until the parent closes the pipe or dies."""
+    os.environ.clear()  # what it was forked from may have been started under other settings
+    os.environ.update(environment)
     if allowed is not None:
         confine(allowed)  # before any thread is started: those that exist already would stay free
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     if memory_bytes:
         resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
-    threading.Thread(target=_die_with, args=(parent,), daemon=True).start()
+    threading.Thread(target=_die_with_parent, daemon=True).start()
     for name in warm:
         importlib.import_module(name)
     while True:
@@ -260,7 +274,8 @@ def _no_memory() -> TooLarge:
     return TooLarge("it needs more memory than an upload may use")
 
 
-def _die_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(0.5)
+def _die_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
     os._exit(1)

@@ -152,7 +152,7 @@ def test_no_process_to_be_had_is_told_as_for_now(pool: Pool, monkeypatch: pytest
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
     with monkeypatch.context() as patch:
-        patch.setattr("multiprocessing.context.SpawnProcess._Popen", refuse)
+        patch.setattr("multiprocessing.context.ForkServerProcess._Popen", refuse)
         with pytest.raises(Unavailable, match="try again"):
             pool.run(work_double, 1)
     assert pool.run(work_double, 1) == 2

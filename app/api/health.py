@@ -72,6 +72,8 @@ async def readyz(request: Request) -> Response:
             await run_in_threadpool(here.store.check)
     except TimeoutError:
         raise Unavailable(f"database or file store did not answer within {READY_SECONDS:g} seconds") from None
+    if not here.prepared.is_set():
+        raise Unavailable("conversions are being prepared: ready in a few seconds")
     events = state_of(here.options.data_dir, here.options.zenoh_mode)
     if here.options.zenoh_mode != "off":
         options = here.options

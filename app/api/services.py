@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -62,6 +63,8 @@ class Services:
     links: SignedLinks
     deltas: Deltas
     fleet: FleetIntake
+    prepared: threading.Event = field(default_factory=threading.Event)
+    """Set once the first map and the first coverage table need not wait for anything to be loaded."""
 
 
 async def services(request: Request) -> Services:

@@ -1,0 +1,22 @@
+"""Imported for its effect: what every first conversion would pay for is loaded.
+
+Worker processes are forked from one that has imported this, and the server is ready once it has. Native code of
+derivations (numba) is left out: most servers never need it.
+"""
+
+import numpy as np
+from PIL import Image
+
+from app import derive, formats, generate
+from app.convert import files, make
+from app.model.frame import Datum
+from app.model.geodesy import distance, local_frame
+
+formats.all_formats()
+derive.all_derivations()
+generate.all_generators()
+Image.preinit()
+local_frame(Datum(0.0, 0.0)).to_local(np.unique(np.zeros((1, 2)), axis=0))
+distance((0.0, 0.0), (0.0, 1.0))
+
+__all__ = ["files", "make"]
