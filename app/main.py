@@ -67,7 +67,7 @@ from app.api.signed import SignedLinks
 from app.api.uploads import Intake
 from app.config import Settings
 from app.convert import Maps
-from app.errors import FleetMapError, Unavailable
+from app.errors import Conflict, FleetMapError, Unavailable
 from app.events import bus
 from app.events.bus import Bus, BusOptions
 from app.events.login import Login
@@ -198,6 +198,8 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
         "server_header": False,
         "timeout_keep_alive": 30,
         "timeout_graceful_shutdown": 20,
+        # Uvicorn's 5 s end workers that are still starting on a busy machine, again and again.
+        "timeout_worker_healthcheck": 120,
     }
     if settings.tls_certificate is not None:
         options |= {"ssl_certfile": str(settings.tls_certificate), "ssl_keyfile": str(settings.tls_key)}
@@ -221,7 +223,7 @@ def open_services(settings: Settings) -> Services:
     store = Store(settings.database, settings.blob_dir)
     pool: Pool | None = None
     try:
-        with _alone(settings.data_dir):
+        with alone(settings.data_dir):
             if settings.database.startswith("sqlite"):
                 store.migrate()
             try:
@@ -414,7 +416,7 @@ def _prepare(here: Services) -> None:
 
 
 @contextlib.contextmanager
-def _alone(data_dir: Path) -> Iterator[None]:
+def alone(data_dir: Path) -> Iterator[None]:
     """One process at a time starts on a data folder: migrations, leftovers and the first token are done once."""
     with (data_dir / "start.lock").open("w") as handle:
         fcntl.flock(handle, fcntl.LOCK_EX)
@@ -428,10 +430,10 @@ def _first_token(store: Store, settings: Settings) -> None:
         if len(text) < 22:
             log.warning("FLEETMAP_ADMIN_TOKEN is short: anybody could guess it. Use 32 random characters")
         if store.find_token(text) is None:
-            store.create_token("administrator", "admin", token=text)
-    elif not any(token.role == "admin" for token in store.tokens()):
-        _, text = store.create_token("administrator", "admin")
-        print(f"administrator's token, shown only this once: {text}", file=sys.stdout, flush=True)
+            with contextlib.suppress(Conflict):  # a server that starts at the same time was quicker
+                store.create_token("administrator", "admin", token=text)
+    elif (made := store.create_administrator()) is not None:
+        print(f"administrator's token, shown only this once: {made}", file=sys.stdout, flush=True)
 
 
 async def _tick(here: Services) -> None:

@@ -82,6 +82,8 @@ def _compile(folder: Path) -> None:
     from app.derive import _native
 
     where = os.environ.setdefault(_native.FOLDER, str(folder.resolve()))
+    if _native.is_filled(Path(where)):
+        return
     process = multiprocessing.get_context("spawn").Process(
         target=_native.fill_quietly, args=(Path(where),), daemon=True
     )
@@ -234,7 +236,8 @@ def check(settings: Settings) -> None:
     """Whether the server could start, told before it does; Unavailable with what to do about it."""
     with _store(settings) as store:
         if settings.database.startswith("sqlite"):
-            store.migrate()
+            with _main().alone(settings.data_dir):
+                store.migrate()
         store.check()
 
 

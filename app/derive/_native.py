@@ -55,13 +55,17 @@ def native(function: F) -> F:
     return cast(F, compiled)
 
 
+def is_filled(where: Path) -> bool:
+    """Whether ``fill`` has nothing to do."""
+    return (where / _key()).is_dir()
+
+
 def fill(where: Path) -> None:
     """Compile all kernels into ``where`` (what ``NUMBA_CACHE_DIR`` names), unless this was done before.
 
     It never reads what stands there, and the new folder appears in one step: nothing half-written is ever loaded.
     """
-    target = where / _key()
-    if target.is_dir():
+    if is_filled(where):
         return
     where.mkdir(parents=True, exist_ok=True)
     for old in where.glob(f"{_PREFIX}*"):  # of other releases
@@ -73,7 +77,7 @@ def fill(where: Path) -> None:
         made = Path(scratch) / _key()
         if made.is_dir():
             with contextlib.suppress(OSError):  # another process was quicker
-                made.rename(target)
+                made.rename(where / _key())
 
 
 def fill_quietly(where: Path) -> None:

@@ -19,10 +19,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import parse_qsl, quote, urlencode, urljoin, urlsplit, urlunsplit
 
-import httpx
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -47,6 +46,9 @@ from app.model.layers import Layers, PartKey
 from app.parameters import describe, parameter
 from app.store.changes import Changes, Prepared, Provenance, Replace
 from app.store.values import Version
+
+if TYPE_CHECKING:
+    import httpx
 
 METHOD = "location_to_imagery"
 MERCATOR = "EPSG:3857"
@@ -273,6 +275,8 @@ class Fetcher:
 
         Raises CannotDerive where it refuses or sends something else, Unavailable where it is down or too slow.
         """
+        import httpx  # most servers never ask a provider, and start sooner without
+
         p = self.provider
         deadline = time.monotonic() + p.seconds
         room = _Room(p.max_bytes)
@@ -311,6 +315,8 @@ class Fetcher:
 
     def _asked(self, client: httpx.Client, block: Block, deadline: float, room: _Room) -> bytes | None:
         """One answer. The address with the token is in no message."""
+        import httpx
+
         url = self._address(block.url)
         try:
             for _ in range(REDIRECTS + 1):

@@ -61,6 +61,22 @@ class Tokens(Base):
             raise Conflict("this token exists already") from error
         return Token(**values), secret
 
+    def create_administrator(self) -> str | None:
+        """The secret of a first administrator's token; None where there is an administrator already.
+
+        Of servers that start together on one database one creates it.
+        """
+        with self._database.write() as connection:
+            if not self._database.sqlite:
+                connection.exec_driver_sql("LOCK TABLE token IN SHARE ROW EXCLUSIVE MODE")
+            table = tables.token
+            if connection.execute(select(table.c.id).where(table.c.role == "admin").limit(1)).first() is not None:
+                return None
+            secret = secrets.token_urlsafe(SECRET_BYTES)
+            values = {"id": secrets.token_hex(8), "name": "administrator", "role": "admin", "created": utcnow()}
+            connection.execute(insert(table).values(hash=_hash(secret), **values))
+        return secret
+
     def tokens(self) -> list[Token]:
         """All tokens, oldest first."""
         table = tables.token

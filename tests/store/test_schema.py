@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,9 +14,10 @@ from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 
 from app.errors import Unavailable
+from app.main import alone
 from app.store import Store
 from app.store.database import Database
-from app.store.schema import comparison, config
+from app.store.schema import comparison, config, newest
 from app.store.tables import metadata
 from app.store.values import Heard, Report
 
@@ -101,4 +103,28 @@ def test_postgres_has_gist_indexes_and_uncompressed_chunks(postgres_url: str, tm
             sa.text("SELECT attstorage FROM pg_attribute WHERE attrelid = 'chunk'::regclass AND attname = 'data'")
         ).scalar_one()
         assert storage in ("e", b"e")
+    store.close()
+
+
+def test_files_of_migrations_tell_the_newest_revision() -> None:
+    assert newest() == ScriptDirectory.from_config(config()).get_current_head()
+
+
+def test_of_servers_that_start_together_one_makes_the_administrator(database_url: str, tmp_path: Path) -> None:
+    def start(number: int) -> str | None:
+        store = Store(database_url, tmp_path / "blobs")
+        try:
+            with alone(tmp_path):
+                store.migrate()
+            store.check()
+            return store.create_administrator()
+        finally:
+            store.close()
+
+    with ThreadPoolExecutor(6) as threads:
+        made = list(threads.map(start, range(6)))
+    assert sum(secret is not None for secret in made) == 1
+    store = Store(database_url, tmp_path / "blobs")
+    assert [token.role for token in store.tokens()] == ["admin"]
+    assert store.find_token(next(filter(None, made))) is not None
     store.close()
