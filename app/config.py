@@ -18,6 +18,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from app.events.ros_names import parse_chosen, parse_keys
 from app.formats import Limits
+from app.logs import LogFormat
 
 _DEFAULTS = Limits()
 
@@ -57,7 +58,12 @@ class Settings(BaseSettings):
         default=False,
         description="Let everybody do everything without a token. Works only while listening on a loopback address.",
     )
-    log_level: Literal["debug", "info", "warning", "error"] = Field(default="info", description="How much is logged.")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info",
+        description="How much is logged. `warning`: refused tokens and failures; `info`: also changes and what takes "
+        "over a second; `debug`: every request but those answered from memory.",
+    )
+    log_format: LogFormat = Field(default="text", description="`text`: lines for people; `json`: an object in a line.")
 
     conversion_workers: int = Field(
         default_factory=lambda: max(1, min(8, os.cpu_count() or 1)),

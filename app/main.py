@@ -24,9 +24,10 @@ from sqlalchemy.engine import make_url
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from app import __version__
+from app import __version__, logs
 from app.api import (
     alignments,
+    audit,
     changes,
     channels,
     convert,
@@ -161,6 +162,7 @@ def create_app(settings: Settings) -> Server:
         vda5050,
         jobs,
         tokens,
+        audit,
     ):
         api.include_router(module.router)
     app.include_router(api)
@@ -193,7 +195,7 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
         "loop": "uvloop" if _has_uvloop() else "auto",
         "ws": "none",
         "lifespan": "on",
-        "log_level": settings.log_level,
+        "log_config": logs.config(settings.log_level, settings.log_format),
         "access_log": False,
         "server_header": False,
         "timeout_keep_alive": 30,

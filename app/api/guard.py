@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
+import re
+import secrets
 import time
 from typing import Any
 from urllib.parse import urlsplit
@@ -23,6 +26,10 @@ from app.api.services import Services
 from app.api.signed import LINK, signed_address
 from app.api.together import Together
 from app.errors import Denied, FleetMapError, TooLarge
+from app.logs import REQUEST_ID, log_request
+from app.store.audit import CALLER, Caller
+
+log = logging.getLogger("app.requests")
 
 MULTIPART_OVERHEAD = 2**20
 """Bytes that a multipart body may have beside its files: field values, plus the parts' heads."""
@@ -38,6 +45,14 @@ DRAIN_SECONDS = 5.0
 _BODY = frozenset({"POST", "PUT", "PATCH"})
 _METHODS = frozenset({"GET", "DELETE", "OPTIONS", *_BODY})
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
+
+
+_REQUEST_ID = re.compile(rb"[A-Za-z0-9._-]{1,64}")
+_REPORT = re.compile(r"/api/v1/robots/[^/]+/status")
+"""A robot's report: no change of a map or of who may do what, and too frequent for the audit log."""
+
+SLOW_SECONDS = 1.0
+"""A request that takes longer is logged like a change."""
 
 
 class _Disconnected(Exception):
@@ -63,15 +78,21 @@ class Guard:
         if head_only:
             # A HEAD is a GET whose body stays here; routes that answer HEAD themselves are told by the state.
             scope = {**scope, "method": "GET", "state": {**scope["state"], "head": True}}
-        answer = _Answer(send, head_only)
+        given = _headers(scope).get(b"x-request-id", b"")
+        request_id = given.decode() if _REQUEST_ID.fullmatch(given) else secrets.token_hex(8)
+        REQUEST_ID.set(request_id)
+        answer = _Answer(send, head_only, request_id)
+        reason = ""
         body = _Body(receive, here)
         try:
             await self._pass(scope, body, answer, here)
         except _Disconnected:
             return
         except FleetMapError as error:
+            reason = error.detail
             await self._refuse(problems.of_error(error), scope, body, answer)
         except HTTPException as error:
+            reason = str(error.detail)
             await self._refuse(problems.of_http(error), scope, body, answer)
         except asyncio.CancelledError:
             raise
@@ -81,7 +102,9 @@ class Guard:
             route = scope["state"].get("route") or _template(scope)
             method = scope["method"] if scope["method"] in _METHODS else "other"
             here.metrics.requests.labels(method, route, str(answer.status)).inc()
-            here.metrics.seconds.labels(route).observe(time.perf_counter() - started)
+            seconds = time.perf_counter() - started
+            here.metrics.seconds.labels(route).observe(seconds)
+            _log(scope, answer.status, seconds, reason)
 
     async def _pass(self, scope: Scope, body: _Body, answer: _Answer, here: Services) -> None:
         headers = _headers(scope)
@@ -93,6 +116,7 @@ class Guard:
             if environment is not None:
                 principal.enter(environment)
             scope["state"]["principal"] = principal
+            CALLER.set(_caller(scope, principal, environment))
         if scope["method"] in _BODY and body.begin(scope, headers):
             await body.preload()
         await self._app(scope, body, answer)
@@ -128,6 +152,45 @@ def _template(scope: Scope) -> str:
     return path if path.startswith(API) or not scope["path"].startswith(API) else API + path
 
 
+def _caller(scope: Scope, who: Principal, environment: str | None) -> Caller | None:
+    """Who stands in the audit log for what this request changes; None where it is not for there."""
+    path = scope["path"]
+    if scope["method"] in ("GET", "OPTIONS") or _REPORT.fullmatch(path):
+        return None
+    return Caller(who.id, who.name, who.role, _address(scope), REQUEST_ID.get(), scope["method"], path, environment)
+
+
+def _address(scope: Scope) -> str:
+    client = scope.get("client")
+    return str(client[0]) if client else "-"
+
+
+def _log(scope: Scope, status: int, seconds: float, reason: str) -> None:
+    """A request: refusals and failures always, changes and slow ones from level info on, the others with debug."""
+    changes = scope["method"] not in ("GET", "OPTIONS") and not _REPORT.fullmatch(scope["path"])
+    if status >= 500 or status in (401, 403, 429):
+        level = logging.WARNING
+    elif changes or seconds > SLOW_SECONDS:
+        level = logging.INFO
+    else:
+        level = logging.DEBUG
+    if not log.isEnabledFor(level):
+        return
+    who = scope["state"].get("principal")
+    fields = {
+        "method": scope["method"],
+        "path": scope["path"],
+        "status": status,
+        "ms": round(seconds * 1000, 1),
+        "token": who.name if who else "",
+        "token_id": who.id if who else "",
+        "role": who.role if who else "",
+        "address": _address(scope),
+        "reason": reason,
+    }
+    log_request(log, level, fields)
+
+
 def _headers(scope: Scope) -> dict[bytes, bytes]:
     return dict(scope["headers"])
 
@@ -150,10 +213,10 @@ def is_from_here(headers: dict[bytes, bytes]) -> bool:
 class _Answer:
     """Sends, and remembers the status; adds ``nosniff``; leaves out the body of a HEAD."""
 
-    __slots__ = ("_head_only", "_send", "started", "status")
+    __slots__ = ("_head_only", "_request_id", "_send", "started", "status")
 
-    def __init__(self, send: Send, head_only: bool) -> None:
-        self._send, self._head_only = send, head_only
+    def __init__(self, send: Send, head_only: bool, request_id: str) -> None:
+        self._send, self._head_only, self._request_id = send, head_only, request_id.encode()
         self.started, self.status = False, 0
 
     async def __call__(self, message: Message) -> None:
@@ -165,6 +228,7 @@ class _Answer:
                 headers.append((b"x-content-type-options", b"nosniff"))
             if b"cache-control" not in names:
                 headers.append((b"cache-control", b"no-cache"))
+            headers.append((b"x-request-id", self._request_id))
             message = {**message, "headers": headers}
         elif self._head_only and message["type"] == "http.response.body":
             if message.get("more_body", False):

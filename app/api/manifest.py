@@ -62,6 +62,7 @@ def rotate_key(here: Here, _: Admin) -> Response:
     """
     made = here.keys.rotate()
     here.links.rotate()
+    here.store.record_change()
     here.store.generation.change()  # what was signed with the old key is in memory no longer
     return answer(made.as_dict(), 201)
 

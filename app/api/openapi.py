@@ -133,6 +133,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("formats", "What can be read, served and converted."),
             ("jobs", "Work that takes long."),
             ("tokens", "Access."),
+            ("audit", "Who changed what, from where."),
             ("health", "Operation."),
         )
     ]

@@ -926,6 +926,27 @@ class TokenOut(BaseModel):
     created: datetime
 
 
+class AuditTokenOut(BaseModel):
+    """The token that made a change, as it was called then."""
+
+    id: str
+    name: str
+    role: str
+
+
+class AuditOut(BaseModel):
+    """One change. request: the `X-Request-Id` of its answer, which the server's log names as well."""
+
+    id: int
+    time: datetime
+    token: AuditTokenOut
+    address: str
+    request: str
+    method: str
+    path: str
+    environment: str | None
+
+
 class NewTokenOut(TokenOut):
     """A new token with its secret, which is told only now."""
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from sqlalchemy import select
 
 from app.store import schema, tables
+from app.store.audit import Audit, record
 from app.store.blobs import Blobs
 from app.store.channels import Channels
 from app.store.chunks import Chunks
@@ -34,6 +35,7 @@ ABANDONED_SECONDS = 24 * 3600.0
 
 
 class Store(
+    Audit,
     Environments,
     Versions,
     Content,
@@ -59,7 +61,7 @@ class Store(
         self.blob_dir = Path(blob_dir)
         self.readonly = readonly
         self.generation = Generation(self.blob_dir)
-        self._database = Database(database_url, readonly=readonly, written=self.generation.change)
+        self._database = Database(database_url, readonly=readonly, written=self.generation.change, record=record)
         self._chunks = Chunks(self._database)
         self.blobs = Blobs(self._database, self.blob_dir, readonly=readonly)
 

@@ -7,13 +7,16 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import orjson
 from sqlalchemy import Connection, Engine, create_engine, event, exc
 from sqlalchemy.engine import make_url
 
 from app.errors import Invalid, Unavailable
+
+if TYPE_CHECKING:
+    from app.store.audit import Caller
 
 BUSY_MILLISECONDS = 5000
 TURN_SECONDS = 30.0
@@ -78,12 +81,20 @@ def _sqlite_begin(connection: Connection) -> None:
 class Database:
     """Transactions on an engine. Every database error that another try may not have becomes Unavailable.
 
-    written: called after each commit, so that caches in memory can tell.
+    written: called after each commit, so that caches in memory can tell. record: adds who makes the change to its
+    transaction.
     """
 
-    def __init__(self, url: str, *, readonly: bool, written: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        readonly: bool,
+        written: Callable[[], None] = lambda: None,
+        record: Callable[[Connection], Caller | None] = lambda _: None,
+    ) -> None:
         self.engine = engine(url, readonly=readonly)
-        self._written = written
+        self._written, self._record = written, record
         self.sqlite = self.engine.dialect.name == "sqlite"
         # SQLite lets whoever happens to look at the right moment write: among many, one may never come to it.
         self._turn = threading.Lock()
@@ -109,6 +120,9 @@ class Database:
             connection.execution_options(write=True)
             with connection.begin():
                 yield connection
+                caller = self._record(connection)
+        if caller is not None:
+            caller.recorded = True
         if tell:
             self._written()
 

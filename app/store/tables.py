@@ -441,3 +441,20 @@ place = Table(
 
 Index("ix_place_geometry", place.c.geometry, postgresql_using="gist", info=POSTGRESQL).ddl_if(dialect="postgresql")
 Index("ix_place_box", place.c.south, place.c.north, place.c.west, place.c.east)
+
+audit = Table(
+    "audit",
+    metadata,
+    Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
+    Column("time", Moment, nullable=False),
+    Column("token_id", String(32), nullable=False),
+    Column("token", Text, nullable=False),
+    Column("role", String(16), nullable=False),
+    Column("address", Text, nullable=False),
+    Column("request_id", String(64), nullable=False),
+    Column("method", String(16), nullable=False),
+    Column("path", Text, nullable=False),
+    Column("environment", String(63), nullable=True),
+    Index("ix_audit_environment", "environment", "id"),
+)
+"""Who changed what, from where. Rows outlive tokens and environments, so they hold their names."""

@@ -1,0 +1,58 @@
+"""The audit log, for administrators."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request
+from starlette.responses import Response
+
+from app.api.access import Admin
+from app.api.answers import Route, page
+from app.api.schemas import AuditOut, Limit, told
+from app.api.services import Here
+from app.errors import Invalid
+from app.store.audit import AuditEntry
+from app.store.values import rfc3339
+
+router = APIRouter(prefix="/audit", tags=["audit"], route_class=Route)
+
+
+@router.get("", responses=told(list[AuditOut]), summary="Who changed what, from where")
+def list_audit(
+    request: Request,
+    here: Here,
+    who: Admin,
+    environment: Annotated[str | None, Query(max_length=63, description="Only changes of this environment.")] = None,
+    token_id: Annotated[str | None, Query(max_length=32, description="Only changes made with this token.")] = None,
+    limit: Limit = 100,
+    cursor: Annotated[
+        str | None, Query(max_length=18, description="Where the page starts: taken from the last page's `Link` header.")
+    ] = None,
+) -> Response:
+    """The newest change first. An entry is stored in the same transaction as its change.
+
+    Takes an administrator's token for all environments. Robots' reports and what the server does by itself (planned
+    moves, closures that end) are not changes of anybody: the events tell of them.
+    """
+    who.demand_everywhere()
+    if cursor is not None and not (cursor.isascii() and cursor.isdigit()):
+        raise Invalid("cursor must be taken from the Link header of the page before")
+    before = None if cursor is None else int(cursor)
+    entries = here.store.audit(environment=environment, token_id=token_id, before=before, limit=limit + 1)
+    more = str(entries[limit - 1].id) if len(entries) > limit else None
+    return page(request, [as_dict(entry) for entry in entries[:limit]], more)
+
+
+def as_dict(entry: AuditEntry) -> dict[str, object]:
+    """One entry as JSON."""
+    return {
+        "id": entry.id,
+        "time": rfc3339(entry.time),
+        "token": {"id": entry.token_id, "name": entry.token, "role": entry.role},
+        "address": entry.address,
+        "request": entry.request_id,
+        "method": entry.method,
+        "path": entry.path,
+        "environment": entry.environment,
+    }
