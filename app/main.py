@@ -411,10 +411,12 @@ def close_services(here: Services) -> None:
 
 def _prepare(here: Services) -> None:
     """Do beside the start what the first request would wait for."""
-    here.pool.start()
-    for name in WARM:
-        importlib.import_module(name)
-    here.prepared.set()
+    try:
+        here.pool.start()
+        for name in WARM:
+            importlib.import_module(name)
+    finally:
+        here.prepared.set()
 
 
 @contextlib.contextmanager

@@ -113,14 +113,14 @@ def list_environments(
             max_length=200,
             pattern=r"^[^\x00]*$",
             description="Text in name, title, description or tags.",
-            examples=["farm"],
+            examples=["orchard"],
         ),
     ] = None,
     contains: Annotated[
         str | None,
         Query(
             description=CONTAINS,
-            examples=["53.2687,-0.5244"],
+            examples=["52.4206,5.6134"],
         ),
     ] = None,
     bbox: Annotated[

@@ -221,7 +221,7 @@ _HEADERS: dict[str, Any] = {
 }
 
 _EXAMPLES = {
-    "env": ("An environment's name.", "farm"),
+    "env": ("An environment's name.", "orchard"),
     "v": ("Number, channel, or `latest`.", "latest"),
     "format": ("A format's id.", "geojson"),
     "file": ("A file's name; it may have folders.", "map.geojson"),

@@ -107,7 +107,7 @@ def forget_robot(
     robot: RobotPath,
     here: Here,
     who: Editor,
-    environment: Annotated[str, Query(pattern=NAME, description="Where it is to be forgotten.", examples=["farm"])],
+    environment: Annotated[str, Query(pattern=NAME, description="Where it is to be forgotten.", examples=["orchard"])],
 ) -> Response:
     """It no longer counts among its channel's robots. It comes back with its next report."""
     who.enter(environment)

@@ -1,6 +1,6 @@
 """The edge's shapes: what bodies and parameters may be, what answers look like, and examples that work.
 
-The examples fit each other: a test runs every one of them against a server that holds the environment ``farm``.
+The examples fit each other: a test runs every one of them against a server that holds the demo.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class DatumBody(In):
 class CloneBody(In):
     """Whose content a new environment starts with."""
 
-    environment: str = Field(examples=["farm"])
+    environment: str = Field(examples=["orchard"])
     version: int | str = Field("latest", description="Number, channel or `latest`.", examples=["latest"])
 
 
@@ -176,7 +176,7 @@ class EditsBody(In):
                             "feature": {
                                 "type": "Feature",
                                 "id": "dock",
-                                "geometry": {"type": "Point", "coordinates": [-0.5245, 53.2687]},
+                                "geometry": {"type": "Point", "coordinates": [5.6133, 52.4206]},
                                 "properties": {"kind": "node", "name": "dock"},
                             },
                         },
@@ -185,9 +185,9 @@ class EditsBody(In):
                             "layer": "topology",
                             "feature": {
                                 "type": "Feature",
-                                "id": "gate_dock",
+                                "id": "Gate_dock",
                                 "geometry": None,
-                                "properties": {"kind": "edge", "source": "gate", "target": "dock"},
+                                "properties": {"kind": "edge", "source": "Gate", "target": "dock"},
                             },
                         },
                     ],
@@ -378,7 +378,7 @@ class StatusBody(In):
         allow_inf_nan=False,
         json_schema_extra={
             "examples": [
-                {"environment": "farm", "channel": "latest", "version": 1, "root": "0" * 64, "state": "active"}
+                {"environment": "orchard", "channel": "latest", "version": 1, "root": "0" * 64, "state": "active"}
             ]
         },
     )
@@ -414,7 +414,7 @@ class OverlayBody(In):
                     "polygon": {
                         "type": "Polygon",
                         "coordinates": [
-                            [[-0.5245, 53.2687], [-0.5244, 53.2687], [-0.5244, 53.2688], [-0.5245, 53.2687]]
+                            [[5.6133, 52.4206], [5.6134, 52.4206], [5.6134, 52.4207], [5.6133, 52.4206]]
                         ],
                     },
                     "crs": "wgs84",
@@ -1089,7 +1089,7 @@ class DeltaOut(BaseModel):
 # --- parameters ---
 
 EnvironmentPath = Annotated[
-    str, Path(pattern=NAME, description="An environment's name.", examples=["farm"], max_length=63)
+    str, Path(pattern=NAME, description="An environment's name.", examples=["orchard"], max_length=63)
 ]
 VersionPath = Annotated[
     str,

@@ -34,7 +34,7 @@ def transform(
     here: Here,
     _: Viewer,
     latlon: Annotated[
-        str | None, Query(description="`LAT,LON` in degrees (WGS 84).", examples=["53.2687,-0.5244"])
+        str | None, Query(description="`LAT,LON` in degrees (WGS 84).", examples=["52.4206,5.6134"])
     ] = None,
     xy: Annotated[str | None, Query(description="`X,Y` in metres of the local frame.")] = None,
     version: Annotated[str, Query(pattern=VERSION, description="Whose datum is meant.")] = "latest",

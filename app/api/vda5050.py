@@ -28,7 +28,7 @@ router = APIRouter(tags=["vda5050"], route_class=Route)
 STATE: dict[str, Any] = {
     "timestamp": "2026-05-01T14:03:07Z",
     "serialNumber": "mower-3",
-    "maps": [{"mapId": "farm", "mapVersion": "1", "mapStatus": "ENABLED", "mapDescriptor": None}],
+    "maps": [{"mapId": "orchard", "mapVersion": "1", "mapStatus": "ENABLED", "mapDescriptor": None}],
 }
 
 

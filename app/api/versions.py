@@ -198,9 +198,9 @@ def list_sources(env: EnvironmentPath, v: VersionPath, here: Here, _: Viewer) ->
 )
 def get_source(
     env: EnvironmentPath,
-    v: Annotated[str, Path(pattern=VERSION, description="Number, channel, or `latest`.", examples=["1"])],
+    v: Annotated[str, Path(pattern=VERSION, description="Number, channel, or `latest`.", examples=["latest"])],
     name: Annotated[
-        str, Path(max_length=1024, description="The file's name, with its folders.", examples=["network.tmap2.yaml"])
+        str, Path(max_length=1024, description="The file's name, with its folders.", examples=["datum.yaml"])
     ],
     request: Request,
     here: Here,

@@ -11,9 +11,10 @@ import pytest
 
 from app import derive
 from app.api.openapi import unguarded
-from app.generate import all_generators
+from app.cli import demo
+from app.cli.client import Client
 from tests.api import samples
-from tests.api.conftest import Api, parts, running, settings_for
+from tests.api.conftest import ADMIN, Api, parts, running, settings_for
 
 UPLOADED = {"datum.yaml": samples.DATUM}
 """Files that the examples of uploads name."""
@@ -21,12 +22,11 @@ UPLOADED = {"datum.yaml": samples.DATUM}
 
 @pytest.fixture(scope="module")
 def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
-    """A server that holds what the examples speak of: the environment farm with a network, and more."""
+    """A server that holds what the examples speak of: the demo, a robot's report."""
     with running(settings_for(tmp_path_factory.mktemp("examples"), job_seconds=60)) as api:
-        api.post("environments", {"name": "farm", "title": "The farm"})
-        files = {"network.tmap2.yaml": samples.tmap2(), "datum.yaml": samples.DATUM, **samples.grid()}
-        api.upload("farm", files)
-        said = {"environment": "farm", "channel": "latest", "version": 1, "root": "0" * 64, "state": "ready"}
+        with Client(api.url, ADMIN) as client:
+            demo.install(client)
+        said = {"environment": "orchard", "channel": "latest", "version": 1, "root": "0" * 64, "state": "ready"}
         api("PUT", "robots/mower-3/status", 200, json=said)
         yield api
 
@@ -62,7 +62,7 @@ def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
             f"{e}/generations": "post", "/api/v1/events": "get", f"{v}/provenance": "get",
         "/api/v1/keys": "get post", f"{v}/manifest": "get", f"{e}/derivations": "post", f"{e}/alignments": "post",
         "/api/v1/robots": "get", "/api/v1/robots/{robot}": "get delete", "/api/v1/robots/{robot}/status": "put",
-        "/api/v1/jobs/{id}": "get delete", "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete",
+        "/api/v1/audit": "get", "/api/v1/jobs/{id}": "get delete", "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete",
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
     }  # fmt: skip
     assert {path: " ".join(sorted(item, key=["get", "post", "put", "patch", "delete"].index))
@@ -143,7 +143,7 @@ def example_of(parameter: dict[str, Any]) -> Any:
 
 
 LANE = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {},
-"geometry": {"type": "LineString", "coordinates": [[-0.524, 53.269], [-0.523, 53.269]]}}]}"""
+"geometry": {"type": "LineString", "coordinates": [[5.6134, 52.4206], [5.6136, 52.4206]]}}]}"""
 
 
 def bodies_of(schema: dict[str, Any], op: dict[str, Any]) -> list[dict[str, Any]]:
@@ -176,19 +176,19 @@ def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -
         where = f"{method} {path}"
         if path == "/api/v1/environments/{env}/channels/{channel}/planned":
             body = {"version": 1, "activate_at": "2099-01-01T00:00:00Z"}
-            api("PUT", "environments/farm/channels/production", 200, json=body)
+            api("PUT", "environments/orchard/channels/production", 200, json=body)
         if "/overlays/{id}/" in path:
             ring = [[0, 0], [1, 0], [1, 1], [0, 0]]
             blocked = {"kind": "blocked", "crs": "local", "polygon": {"type": "Polygon", "coordinates": [ring]}}
             if path.endswith(("/end", "/keep")):
                 blocked["state"] = "accepted"
-            known[path] = api("POST", "environments/farm/overlays", None, json=blocked).json()["id"]
+            known[path] = api("POST", "environments/orchard/overlays", None, json=blocked).json()["id"]
+        if path.endswith("/sources/{name}"):
+            api.upload("orchard", UPLOADED)
         if path == "/api/v1/environments/{env}/derivations":
-            api.upload("farm", {"lane.geojson": LANE})
-        if path == "/api/v1/environments/{env}/generations" and "orchard" not in all_generators():
-            continue
+            api.upload("orchard", {"lane.geojson": LANE})
         if _name((path, method, op)) == "purge_environment":
-            api("DELETE", "environments/farm", 204)
+            api("DELETE", "environments/orchard", 204)
         query: dict[str, Any] = {}
         target = path
         for parameter in op.get("parameters", ()):
