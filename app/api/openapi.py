@@ -9,7 +9,7 @@ from fastapi import FastAPI, Request
 from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
-from starlette.responses import RedirectResponse, Response
+from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from app import formats, parameters
 from app.api.access import AtLeast, is_open
@@ -19,6 +19,24 @@ from app.api.schemas import ProblemOut, RevertBody, told
 from app.derive import all_derivations
 from app.errors import NotFound
 from app.model.closures import CLOSURE_MODES
+
+SESSION_SCRIPT = """\
+// The token stays until the tab is closed, and no longer: the page's own memory would outlive the browser.
+const key = "fleetmap-token";
+let restored = false;
+ui.getStore().subscribe(() => {
+  if (!ui.specSelectors.specJson().size) return;
+  if (!restored) {
+    restored = true;
+    const kept = sessionStorage.getItem(key);
+    if (kept) ui.preauthorizeApiKey("token", kept);
+    return;
+  }
+  const given = ui.authSelectors.authorized().getIn(["token", "value"]);
+  if (given) sessionStorage.setItem(key, given);
+  else sessionStorage.removeItem(key);
+});
+"""
 
 ASSETS = {
     "swagger-ui-bundle.js": "text/javascript",
@@ -49,7 +67,7 @@ def add_pages(app: FastAPI) -> None:
         return Response(orjson.dumps(app.openapi()), media_type="application/json")
 
     async def docs(_: Request) -> Response:
-        return get_swagger_ui_html(
+        page = get_swagger_ui_html(
             openapi_url="/openapi.json",
             title=f"{app.title}: HTTP interface",
             swagger_js_url="/docs/swagger-ui-bundle.js",
@@ -57,6 +75,7 @@ def add_pages(app: FastAPI) -> None:
             swagger_favicon_url="/docs/favicon.png",
             swagger_ui_parameters={"persistAuthorization": False, "docExpansion": "none", "tryItOutEnabled": True},
         )
+        return HTMLResponse(bytes(page.body).decode().replace("</body>", f"<script>{SESSION_SCRIPT}</script></body>"))
 
     async def asset(request: Request) -> Response:
         name = request.path_params["name"]
@@ -120,6 +139,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("sources", "The uploaded files, byte for byte."),
             ("layers", "Canonical content."),
             ("maps", "Maps in a format, converted on demand."),
+            ("maps by format", "The short address of each format, with the parameters of that format."),
             ("channels", "Which version robots drive on."),
             ("robots", "Who holds what, who lags."),
             ("overlays", "What robots report as blocked."),
@@ -128,6 +148,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("manifest", "What a robot verifies."),
             ("transform", "Between earth and local frame."),
             ("derivations", "What is computed from what, and committing it."),
+            ("alignments", "Laying a map of another frame onto what is stored."),
             ("generations", "Sites made up from parameters and a seed."),
             ("templates", "What is filled in where a format asks for more than the layers have."),
             ("formats", "What can be read, served and converted."),
@@ -207,6 +228,34 @@ def _map_paths(paths: dict[str, Any]) -> None:
             },
         }
         paths[path] = {"get": operation}
+    short = paths["/maps/{env}/{format}"]["get"]
+    for known in formats.all_formats().values():
+        if known.write is None:
+            continue
+        names = {"env", "derive", "closures", *(p["name"] for p in _header_parameters())}
+        common = [p for p in short["parameters"] if p["name"] in names]
+        paths[f"/maps/{{env}}/{known.name}"] = {
+            "get": {
+                **short,
+                "tags": ["maps by format"],
+                "summary": known.title,
+                "operationId": f"get_{known.name}",
+                "parameters": [*common[:1], *_own_parameters(known), *common[1:]],
+            }
+        }
+
+
+def _own_parameters(known: formats.Format) -> list[dict[str, Any]]:
+    """The parameters of one format's writer."""
+    return [
+        {
+            "name": option["name"],
+            "in": "query",
+            "description": f"{option['description']} Default: {option['default']!r}.",
+            "schema": dict(option["schema"]),
+        }
+        for option in parameters.describe(known.write_options)
+    ]
 
 
 _HEADERS: dict[str, Any] = {
