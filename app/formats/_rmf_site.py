@@ -9,16 +9,19 @@ drawing.rs, misc.rs, model.rs, scenario.rs, nav_graph.rs), and its legacy module
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import orjson
 
 from app.formats import _ron
 from app.formats._network import number
 from app.formats._rmf import CABIN_HEIGHT, mapping, refuse, value_of
+from app.model.frame import MAX_METRES
 
 NAME = "rmf_site"
 VERSION = "0.1"
@@ -126,13 +129,22 @@ def references(value: Any, where: str, count: int | None = None) -> list[str]:
     return [reference(v, f"{where}[{k}]") for k, v in enumerate(value)]
 
 
-def elements(value: Any, where: str) -> list[tuple[str, dict[str, Any]]]:
-    """The elements of a mapping by id, by number."""
+def by_id(value: Any, where: str) -> list[tuple[str, Any]]:
+    """The members of a mapping whose keys are ids, by number."""
     said = mapping(value, where)
     for key in said:
         if not key.isascii() or not key.isdigit() or len(key) > 10 or int(key) >= 2**32 or str(int(key)) != key:
             refuse(f"{key[:40]!r} is no id: a whole number below 2^32", where)
-    return [(key, mapping(said[key], f"{where}.{key}")) for key in sorted(said, key=int)]
+    return [(key, said[key]) for key in sorted(said, key=int)]
+
+
+def elements(value: Any, where: str) -> list[tuple[str, dict[str, Any]]]:
+    """The elements of a mapping by id, by number; each is a mapping."""
+    listed = by_id(value, where)
+    for key, said in listed:
+        if not isinstance(said, dict):
+            refuse("must be a mapping", f"{where}.{key}")
+    return listed
 
 
 def variant(value: Any, where: str) -> tuple[str, Any]:
@@ -148,7 +160,10 @@ def vector(value: Any, size: int, where: str) -> list[float]:
     """That many numbers."""
     if not isinstance(value, list) or len(value) != size:
         refuse(f"must be a list of {size} numbers", where)
-    return [number(v, f"{where}[{k}]") for k, v in enumerate(value)]
+    out = [number(v, f"{where}[{k}]") for k, v in enumerate(value)]
+    if max(map(abs, out)) > MAX_METRES:
+        refuse(f"is beyond ±{MAX_METRES:g}", where)
+    return out
 
 
 def text(value: Any, where: str) -> str:
@@ -166,6 +181,8 @@ def angle(value: Any, where: str) -> float:
     if name not in ("deg", "rad"):
         refuse(f"must be deg or rad, is {name[:40]!r}", where)
     said = number(content, where)
+    if abs(said) > MAX_METRES:
+        refuse(f"is beyond ±{MAX_METRES:g}", where)
     return math.radians(said) if name == "deg" else said
 
 
@@ -245,6 +262,11 @@ def ordered(value: Any) -> Any:
     return list(map(ordered, value)) if isinstance(value, (list, tuple)) else value
 
 
+def digest(site: Mapping[str, Any]) -> str:
+    """What tells parts of one site from those of another."""
+    return hashlib.sha256(orjson.dumps(ordered(site))).hexdigest()[:16]
+
+
 def unknown(said: Mapping[str, Any], section: str) -> list[str]:
     """The members that no release of the format has."""
     return sorted(said.keys() - MEMBERS[section])
@@ -264,13 +286,17 @@ def height(said: Any, where: str) -> float | None:
 # --- doors -----------------------------------------------------------------------------------------------------------
 
 
+DOORS = ("SingleSliding", "DoubleSliding", "SingleSwing", "DoubleSwing", "Model")
+
+
 def door_parameters(kind: Any, where: str) -> dict[str, Any]:
     """A door's kind in a building's words; a swing to both sides is of the forward one."""
     name, content = variant(kind, where)
-    said = mapping(content, where)
-    sliding = name.endswith("Sliding")
-    if name not in ("SingleSliding", "DoubleSliding", "SingleSwing", "DoubleSwing"):
+    if name not in DOORS or not isinstance(content, dict):
+        refuse(f"must be one of {', '.join(DOORS)} and its members", where)
+    if name == "Model":
         return {}
+    said, sliding = content, name.endswith("Sliding")
     out: dict[str, Any] = {"type": [1, ("double_" if name[0] == "D" else "") + ("sliding" if sliding else "hinged")]}
     if name[0] == "D":
         ratio = number(said.get("left_right_ratio", 1.0), f"{where}.left_right_ratio")
@@ -456,15 +482,15 @@ def cabin_size(cabin: Cabin) -> list[float]:
 # --- graphs, models, textures ----------------------------------------------------------------------------------------
 
 
-def graphs_of(said: Any, known: Mapping[str, int], where: str) -> list[int]:
-    """The numbers of the graphs that an element is of. known: number by id."""
+def graphs_of(said: Any, known: Mapping[str, int], where: str) -> tuple[int, int]:
+    """(the first graph of an element, how many it is of). known: the graphs' numbers by id, smallest first."""
     name, content = variant("All" if said is None else said, where)
-    if name == "All":
-        return sorted(known.values())
-    if name not in ("Only", "AllExcept"):
+    if name not in ("All", "Only", "AllExcept"):
         refuse(f"must be All, Only or AllExcept, is {name[:40]!r}", where)
-    ids = set(references(content, where))
-    return sorted(number_ for i, number_ in known.items() if (i in ids) == (name == "Only"))
+    ids = set() if name == "All" else set(references(content, where)) & known.keys()
+    if name == "Only":
+        return min((known[i] for i in ids), default=0), len(ids)
+    return next((number_ for i, number_ in known.items() if i not in ids), 0), len(known) - len(ids)
 
 
 def graph_numbers(graphs: Iterable[tuple[str, Mapping[str, Any]]], ranking: Sequence[str]) -> dict[str, int]:
@@ -472,7 +498,8 @@ def graph_numbers(graphs: Iterable[tuple[str, Mapping[str, Any]]], ranking: Sequ
     listed = sorted(graphs, key=lambda item: ranking.index(item[0]) if item[0] in ranking else len(ranking))
     names = [str(said.get("name")) for _, said in listed]
     numbered = all(n.isascii() and n.isdigit() and len(n) < 4 for n in names) and len(set(names)) == len(names)
-    return {i: int(n) if numbered else k for k, ((i, _), n) in enumerate(zip(listed, names, strict=True))}
+    out = {i: int(n) if numbered else k for k, ((i, _), n) in enumerate(zip(listed, names, strict=True))}
+    return dict(sorted(out.items(), key=lambda item: item[1]))
 
 
 def asset(said: Any, where: str) -> tuple[str, str]:

@@ -88,12 +88,12 @@ class _Floor:
 
 @dataclass(slots=True)
 class _Lift:
-    """A lift being written. anchors: of its cabin by id; by_place: those that are nodes, by their place in it."""
+    """A lift being written. anchors: of its cabin by id; by_place: those that are nodes, by their place and name."""
 
     cabin: Cabin
     said: dict[str, Any]
     anchors: dict[str, Any]
-    by_place: dict[tuple[float, float], str] = field(default_factory=dict)
+    by_place: dict[tuple[float, float, str], str] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -125,11 +125,11 @@ class _Writer:
         for part in layers.of("resources", name=BUILDING).values():
             self.resources.update(part.files if isinstance(part, Resources) else {})
         documents = [_document(storey) for storey in storeys]
-        sites = [d["site"] for d in documents if isinstance(d.get("site"), dict)]
-        self.known: dict[str, Any] = sites[0] if sites else {}
-        if any(s != self.known for s in sites):
+        first = next((d for d in documents if isinstance(d.get("site"), dict)), {})
+        self.known: dict[str, Any] = first.get("site", {})
+        if any(d.get("of") != first.get("of") for d in documents if d):
             context.warn("the levels come from different sites: what belongs to all of a site is the first one's")
-        documents = [d if d.get("site") == self.known else {} for d in documents]
+        documents = [d if first and d.get("of") == first.get("of") else {} for d in documents]
         self.same = {s.name for s, d in zip(storeys, documents, strict=True) if d}
         self.mentioned = _ids(documents, storeys, self.same)
         self.claimed: set[str] = set(_ids_of(self.known))
@@ -146,6 +146,8 @@ class _Writer:
         self.groups: dict[str, Any] = dict(mapping(self.known.get("fiducial_groups"), "fiducial_groups"))
         self.descriptions: dict[str, Any] = dict(mapping(self.known.get("model_descriptions"), "model_descriptions"))
         self.robot_types: dict[str, Any] = dict(mapping(self.known.get("robots"), "robots"))
+        self.description_ids = {_key([d, i in self.robot_types]): i for i, d in self.descriptions.items()}
+        self.mutex_ids, self.group_ids = _by_name(self.mutexes), _by_name(self.groups)
         self.instances: dict[str, Any] = {}
         self.fresh: list[str] = []
         self.moved: dict[str, tuple[Any, Any]] = {}
@@ -297,11 +299,11 @@ class _Writer:
         for _, i, p, xyz in sorted(found, key=lambda item: item[0]):
             rest, words = self._rest(floor, p), {**_words(p), **self.robots.at(floor.storey.name, i)}
             lift = self.lifts.get(str(rest.get("lift") or words.get("lift_cabin") or words.get("lift") or ""))
-            anchor = self._node_anchor(floor, lift, xyz, rest)
+            name = str(p.get("name") or ("" if BUILDING in p or NAV_GRAPH in p else i))
+            anchor = self._node_anchor(floor, lift, xyz, rest, name)
             floor.nodes.setdefault(i, anchor)
             if words.get("dock_name"):
                 self.docks[floor.storey.name, i] = str(words["dock_name"])
-            name = str(p.get("name") or ("" if BUILDING in p or NAV_GRAPH in p else i))
             self._location(anchor, name, words, mapping(rest.get("locations"), "locations"))
             self._robot(floor, words, rest, xyz)
             for word in words.keys() - SAID_ELSEWHERE:
@@ -309,14 +311,16 @@ class _Writer:
             if BUILDING not in p and NAV_GRAPH not in p:
                 self.lost["nodes' attributes of other formats"] += any(isinstance(v, dict) for v in p.values())
 
-    def _node_anchor(self, floor: _Floor, lift: _Lift | None, xyz: list[float], rest: Mapping[str, Any]) -> str:
+    def _node_anchor(
+        self, floor: _Floor, lift: _Lift | None, xyz: list[float], rest: Mapping[str, Any], name: str
+    ) -> str:
         if lift is None:
             anchor = self._claim(rest.get("anchor"))
             floor.anchors[anchor] = self._said_anchor(xyz, rest.get("says"))
             floor.by_place.setdefault(_spot(xyz), anchor)
             return anchor
         inside = lift.cabin.inward(xyz)
-        spot = (round(inside[0], 6) + 0.0, round(inside[1], 6) + 0.0)
+        spot = (round(inside[0], 6) + 0.0, round(inside[1], 6) + 0.0, name)
         if spot not in lift.by_place:
             lift.by_place[spot] = anchor = self._claim(rest.get("anchor"))
             lift.anchors[anchor] = self._said_anchor([*inside, 0.0], rest.get("says"))
@@ -341,6 +345,8 @@ class _Writer:
         same_name = name in spoken or (not name and set(spoken) <= {"", _rmf_site.UNNAMED})
         known = {tag for one in said.values() for tag in one.get("tags") or [] if isinstance(tag, str)}
         for k, (i, one) in enumerate(said.items()):
+            if self.locations.get(i, {}).get("anchor") == int(anchor):
+                continue  # of a lift's cabin, whose anchor is a node of several levels
             now = {**one, "anchor": int(anchor)}
             if not k and not same_name:
                 now["name"] = name
@@ -349,11 +355,14 @@ class _Writer:
             self.locations[self._claim(int(i))] = now
 
     def _mutex(self, name: str) -> str:
-        known = next((i for i, said in self.mutexes.items() if said.get("name") == name), None)
-        if known is None:
-            known = self._claim()
-            self.mutexes[known] = {"name": name}
-        return known
+        return self._named(self.mutexes, self.mutex_ids, name)
+
+    def _named(self, groups: dict[str, Any], ids: dict[str, str], name: str) -> str:
+        """The group of this name; a new one where there is none."""
+        if name not in ids:
+            ids[name] = self._claim()
+            groups[ids[name]] = {"name": name}
+        return ids[name]
 
     # lanes
 
@@ -645,15 +654,8 @@ class _Writer:
         if self.groups.get(str(said.get("affiliation")), {}).get("name", "") != name:
             said.pop("affiliation", None)
             if name:
-                said["affiliation"] = int(self._group(name))
+                said["affiliation"] = int(self._named(self.groups, self.group_ids, name))
         drawing.setdefault("fiducials", {})[self._claim(rest.get("id"))] = said
-
-    def _group(self, name: str) -> str:
-        known = next((i for i, said in self.groups.items() if said.get("name") == name), None)
-        if known is None:
-            known = self._claim()
-            self.groups[known] = {"name": name}
-        return known
 
     # models
 
@@ -699,13 +701,13 @@ class _Writer:
         said = {"name": PurePosixPath(model).name or model, "source": source}
         said |= {"is_static": True} if static else {}
         said |= {} if scale is None else {"scale": scale}
-        found = next((i for i, d in self.descriptions.items() if d == said and (i in self.robot_types) == robot), None)
-        if found is None:
-            found = self._claim()
+        key = _key([said, robot])
+        if key not in self.description_ids:
+            found = self.description_ids[key] = self._claim()
             self.descriptions[found] = said
             if robot:
                 self.robot_types[found] = {"properties": {}}
-        return found
+        return self.description_ids[key]
 
     def _robot(self, floor: _Floor, words: Mapping[str, Any], rest: Mapping[str, Any], xyz: Sequence[float]) -> None:
         """The robot that starts at a node."""
@@ -833,6 +835,11 @@ class _Writer:
             self.context.fill("lifts: doors", "none", f"{self.made['lifts']} lifts come from a navigation graph")
 
 
+def _by_name(groups: Mapping[str, Any]) -> dict[str, str]:
+    """The id of the first group of each name."""
+    return {str(said.get("name")): i for i, said in reversed(list(groups.items()))}
+
+
 def _near(a: Sequence[float], b: Sequence[float]) -> bool:
     return abs(a[0] - b[0]) < SAME_METRES and abs(a[1] - b[1]) < SAME_METRES
 
@@ -850,11 +857,8 @@ def _words(p: Properties) -> dict[str, Any]:
 
 def _document(storey: Storey) -> dict[str, Any]:
     """What the level's parts say as parts of a site."""
-    for part in (*storey.objects, *storey.networks):
-        said = part.document.get(NAME)
-        if isinstance(said, dict) and isinstance(said.get("site"), dict):
-            return said
-    return {}
+    found = (part.document.get(NAME) for part in (*storey.objects, *storey.networks))
+    return next((said for said in found if isinstance(said, dict)), {})
 
 
 def _nodes_of(storeys: Iterable[Storey]) -> Iterator[tuple[str, str, Properties]]:

@@ -30,7 +30,19 @@ from app.formats import Files, Format, Needs, ReadContext, _json, _rmf, _rmf_sit
 from app.formats._network import number
 from app.formats._rmf import BUILDING, NAV_GRAPH, Array, mapping, refuse
 from app.formats._rmf_images import companions_of, images
-from app.formats._rmf_site import NAME, UNNAMED, Cabin, elements, place, reference, references, text, unknown, variant
+from app.formats._rmf_site import (
+    NAME,
+    UNNAMED,
+    Cabin,
+    by_id,
+    elements,
+    place,
+    reference,
+    references,
+    text,
+    unknown,
+    variant,
+)
 from app.formats._rmf_site_writing import FILE, FILE_RON, WriteOptions, write
 from app.model.features import Features, Properties, features, points, segments, unique_ids
 from app.model.frame import GROUND, Datum, Level
@@ -49,12 +61,13 @@ _LISTS = frozenset({"anchors", "doors", "floors", "walls", "models", "drawings"}
 SAME_PLACE = 1e-3
 """Metres between a robot and the location that it starts at."""
 
-MAX_PLAIN_METRES = 1e7
-
 
 @dataclass(slots=True)
 class _Level:
-    """A level as its file says it. anchors: [x, y, z] by id; nodes: id of a node by its anchor."""
+    """A level as its file says it.
+
+    anchors: [x, y, z] by id. nodes: id of a node by its anchor. cabins: anchors in lifts that are nodes of the level.
+    """
 
     id: str
     name: str
@@ -63,7 +76,7 @@ class _Level:
     elevation: float
     anchors: dict[str, list[float]]
     nodes: dict[str, str] = field(default_factory=dict)
-    cabins: dict[str, str] = field(default_factory=dict)
+    cabins: set[str] = field(default_factory=set)
 
     @property
     def where(self) -> str:
@@ -125,10 +138,18 @@ class _Reader:
             for i, said in elements(guided.get("mutex_groups"), f"{where}.mutex_groups")
         }
         self.lifts = [self._lift(i, said) for i, said in elements(top.get("lifts"), "lifts")]
+        self.cabins = {
+            anchor: lift
+            for lift in self.lifts
+            for anchor in mapping(lift.said.get("cabin_anchors"), f"lifts.{lift.id}.cabin_anchors")
+        }
+        self.homes: dict[str, list[_Level]] = {}
         self.textures = dict(elements(top.get("textures"), "textures"))
         self.groups = dict(elements(top.get("fiducial_groups"), "fiducial_groups"))
         self.descriptions = dict(elements(top.get("model_descriptions"), "model_descriptions"))
-        self.robots = mapping(top.get("robots"), "robots")
+        self.robots = dict(elements(top.get("robots"), "robots"))
+        for i, scenario in elements(top.get("scenarios"), "scenarios"):
+            mapping(scenario.get("instances"), f"scenarios.{i}.instances")
         self.dangling: dict[str, dict[str, Any]] = {}
         self.placed = self._placed()
         for section in ("", "properties", "navigation"):
@@ -154,13 +175,7 @@ class _Reader:
             self.strange[f"{section}: {member[:60]}" if section else member[:60]] += 1
 
     def _anchors(self, said: Any, where: str) -> dict[str, list[float]]:
-        listed = mapping(said, where)
-        elements(dict.fromkeys(listed), where)
-        out = {key: place(listed[key], "General", f"{where}.{key}") for key in sorted(listed, key=int)}
-        for key, at in out.items():
-            if max(map(abs, at)) > MAX_PLAIN_METRES:
-                refuse(f"is beyond ±{MAX_PLAIN_METRES:g} metres", f"{where}.{key}")
-        return out
+        return {key: place(raw, "General", f"{where}.{key}") for key, raw in by_id(said, where)}
 
     def _levels(self) -> dict[str, _Level]:
         listed = elements(self.top.get("levels"), "levels")
@@ -252,8 +267,11 @@ class _Reader:
             site["models"] = sorted(int(i) for listed in self.placed.values() for i, _ in listed)
         if self.dangling:
             site["dangling"] = self.dangling
+        digest = _rmf_site.digest(site)
         for i, level in self.levels.items():
-            document = {BUILDING: building[i], NAME: self._document(level, site)}
+            document = {BUILDING: building[i], NAME: {"of": digest, **self._document(level)}}
+            if not level.order:
+                document[NAME]["site"] = site
             out[PartKey("topology", level.name, NETWORK)] = networks[i].with_document(document)
             out[PartKey("objects", level.name, BUILDING)] = features(objects[i], "local", document)
         if not taken:  # nothing of the network is there: a map of this family alone, and of no other
@@ -268,7 +286,8 @@ class _Reader:
             times = f" ({count} times)" if count > 1 else ""
             self.context.warn(f"unknown member {member!r}{times}: it is kept for the way back and not understood")
 
-    def _document(self, level: _Level, site: Mapping[str, Any]) -> dict[str, Any]:
+    def _document(self, level: _Level) -> dict[str, Any]:
+        """What of a level is no item, and what its items do not say."""
         rest = {key: value for key, value in level.said.items() if key not in _LISTS}
         rest["id"] = level.id
         drawings: dict[str, Any] = {}
@@ -286,7 +305,7 @@ class _Reader:
             for anchor, raw in mapping(level.said.get("anchors"), f"{level.where}.anchors").items()
             if anchor not in level.nodes and "Translate2D" not in raw
         }
-        return {"site": site, "level": rest, "drawings": drawings, "forms": forms, "order": level.order}
+        return {"level": rest, "drawings": drawings, "forms": forms, "order": level.order}
 
     # the network
 
@@ -298,17 +317,15 @@ class _Reader:
         robots = self._robots_at()
         out = {}
         for i, level in self.levels.items():
-            ids, places, properties = [], [], []
-            for k, (anchor, node) in enumerate(level.nodes.items()):
+            ids, properties = list(level.nodes.values()), []
+            for k, anchor in enumerate(level.nodes):
                 p = self._node(level, anchor, k, locations.get(anchor, []), docks.get((i, anchor)))
                 if (robot := robots.get((i, anchor))) is not None:
                     said = p[BUILDING].setdefault("parameters", {})
                     said[_rmf.ROBOT], said[_rmf.ROBOT_TYPE] = [1, robot["name"]], [1, robot.pop("model_name")]
                     p[NAME]["robot"] = robot
-                ids.append(node)
-                places.append(self._node_place(level, anchor))
                 properties.append(p)
-            xyz = np.array(places, np.float64).reshape(-1, 3)
+            xyz = np.array([self._node_place(level, a) for a in level.nodes], np.float64).reshape(-1, 3)
             geometry = points(xyz[:, :2])
             if (high := xyz[:, 2] != 0).any():
                 geometry[high] = points(xyz[high] + np.array([0.0, 0.0, level.elevation]))
@@ -317,10 +334,11 @@ class _Reader:
         return out
 
     def _node_place(self, level: _Level, anchor: str) -> list[float]:
+        """[x, y, height above the level] of a node."""
         if anchor in level.anchors:
             return level.anchors[anchor]
-        lift = next(lift for lift in self.lifts if lift.id == level.cabins[anchor])
-        raw = mapping(lift.said.get("cabin_anchors"), "cabin_anchors")[anchor]
+        lift = self.cabins[anchor]
+        raw = lift.said["cabin_anchors"][anchor]
         return [*lift.cabin.outward(place(raw, "General", f"lifts.{lift.id}.cabin_anchors.{anchor}")), 0.0]
 
     def _locations(self) -> dict[str, list[tuple[str, dict[str, Any]]]]:
@@ -334,31 +352,22 @@ class _Reader:
 
     def _name_nodes(self, locations: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]], taken: set[str]) -> None:
         """Which anchors of which levels are nodes, and their ids."""
-        homes = {anchor: level for level in self.levels.values() for anchor in level.anchors}
-        cabins = {
-            anchor: lift
-            for lift in self.lifts
-            for anchor in mapping(lift.said.get("cabin_anchors"), f"lifts.{lift.id}.cabin_anchors")
-        }
+        owners = {anchor: level for level in self.levels.values() for anchor in level.anchors}
         moved: set[str] = set(locations)
-        inside: list[tuple[_Level, str]] = []
         for i, said in self.lanes:
             self._look(said, "lanes")
             ends = references(said.get("anchors"), f"navigation.guided.lanes.{i}.anchors", 2)
             moved.update(ends)
             for here, other in (ends, ends[::-1]):
-                if here in cabins and other in homes:
-                    inside.append((homes[other], here))
-        for i in [i for i in locations if i in cabins]:
-            if not any(anchor == i for _, anchor in inside):
-                served = cabins[i].visits
-                inside.append((self.levels[served[0]] if served else next(iter(self.levels.values())), i))
+                if here in self.cabins and other in owners:
+                    owners[other].cabins.add(here)
+        inside = {anchor for level in self.levels.values() for anchor in level.cabins}
+        for anchor in locations.keys() & self.cabins.keys() - inside:
+            served = self.cabins[anchor].visits
+            self.levels[served[0] if served else next(iter(self.levels))].cabins.add(anchor)
         for level in self.levels.values():
             fixed = {a for kind in ("walls", "doors", "floors") for _, s in self._items(level, kind) for a in s[0]}
             names = [a for a in level.anchors if a in moved or a not in fixed]
-            for owner, anchor in inside:
-                if owner is level and anchor not in level.cabins:
-                    level.cabins[anchor] = cabins[anchor].id
             names += sorted(level.cabins, key=int)
             wanted = []
             for anchor in names:
@@ -368,9 +377,11 @@ class _Reader:
             ids = unique_ids(wanted, taken)
             taken.update(ids)
             level.nodes = dict(zip(names, ids, strict=True))
-        strangers = [i for anchor, listed in locations.items() for i, _ in listed if anchor not in homes | cabins]
-        if strangers:
-            self._keep("locations", {i: said for i, said in self.locations if i in strangers})
+            for anchor in names:
+                self.homes.setdefault(anchor, []).append(level)
+        lost = {i: said for anchor, listed in locations.items() if anchor not in self.homes for i, said in listed}
+        if lost:
+            self._keep("locations", lost)
 
     def _keep(self, section: str, items: dict[str, Any]) -> None:
         self.dangling.setdefault(section, {}).update(items)
@@ -388,13 +399,12 @@ class _Reader:
         p: dict[str, Any] = {"kind": "node"}
         rest: dict[str, Any] = {"anchor": int(anchor)}
         parameters: dict[str, Any] = {}
-        lift = level.cabins.get(anchor)
         source: Any = level.said.get("anchors")
-        if lift is not None:
-            found = next(one for one in self.lifts if one.id == lift)
-            parameters["lift_cabin"] = [1, found.name]
-            source = found.said.get("cabin_anchors")
-            rest["lift"] = found.name
+        if anchor in level.cabins:
+            lift = self.cabins[anchor]
+            parameters["lift_cabin"] = [1, lift.name]
+            source = lift.said["cabin_anchors"]
+            rest["lift"] = lift.name
         if "Translate2D" not in (raw := source[anchor]):
             rest["says"] = raw
         for i, said in locations:
@@ -425,6 +435,7 @@ class _Reader:
         docks: dict[tuple[str, str], str] = {}
         lost: dict[str, Any] = {}
         counts: Counter[str] = Counter()
+        made: list[tuple[str, str, Any, Properties]] = []
         several = 0
         for i, said in self.lanes:
             where = f"navigation.guided.lanes.{i}"
@@ -434,30 +445,29 @@ class _Reader:
                 lost[i] = said
                 continue
             level, target = found
-            places = [self._node_place(level, ends[0]), self._node_place(target, ends[1])]
-            if target is not level:
-                for at, home in zip(places, (level, target), strict=True):
-                    at[2:] = [at[2] + home.elevation]
-            graphs = _rmf_site.graphs_of(said.get("graphs"), self.graphs, f"{where}.graphs")
-            several += len(graphs) > 1
+            xyz = np.array([self._node_place(home, end) for home, end in zip(found, ends, strict=True)])
+            if target is not level or xyz[:, 2].any():
+                xyz[:, 2] += [home.elevation for home in found]
+            line = xyz if target is not level or xyz[:, 2].any() else xyz[:, :2]
+            graph, graphs = _rmf_site.graphs_of(said.get("graphs"), self.graphs, f"{where}.graphs")
+            several += graphs > 1
             for both, motion, backward in self._motions(said, where):
                 mirrored = both and backward
                 a, b = (1, 0) if backward else (0, 1)
-                homes = (level, target)
-                source, end = homes[a].nodes[ends[a]], homes[b].nodes[ends[b]]
+                source, end = found[a].nodes[ends[a]], found[b].nodes[ends[b]]
                 counts[level.id] += not mirrored
                 orientation, limit = motion_words(motion, where)
                 mutex = self._mutex(said, where)
                 parameters: dict[str, Any] = {
                     "bidirectional": [4, both],
-                    "graph_idx": [2, graphs[0] if graphs else 0],
+                    "graph_idx": [2, graph],
                     "orientation": [1, _rmf.turned(orientation) if mirrored else orientation],
                     **({} if mutex is None else {"mutex": [1, mutex]}),
                     **({"speed_limit": [3, limit]} if limit else {}),
                 }
                 if motion.get("dock") is not None:
                     dock = mapping(motion["dock"], f"{where}.dock")
-                    docks[homes[b].id, ends[b]] = text(dock.get("name"), f"{where}.dock.name")
+                    docks[found[b].id, ends[b]] = text(dock.get("name"), f"{where}.dock.name")
                 rest = {"index": counts[level.id] - 1, "parameters": parameters}
                 if mirrored:
                     rest["reverse"] = True
@@ -466,11 +476,11 @@ class _Reader:
                 p[NAME] = {"lane": int(i), "says": {k: v for k, v in said.items() if k != "anchors"}}
                 if backward:
                     p[NAME]["reverse"] = True
-                flat = not places[0][2] and not places[1][2]
-                line = np.array([places[a], places[b]])[:, : 2 if flat else 3]
-                name = unique_ids([_rmf.short(f"{source}_{end}", 490)], taken)[0]
-                taken.add(name)
-                rows[level.id].append((name, segments(line[:1], line[1:])[0], p))
+                made.append((level.id, _rmf.short(f"{source}_{end}", 490), segments(line[[a]], line[[b]])[0], p))
+        names = unique_ids((wanted for _, wanted, _, _ in made), taken)
+        taken.update(names)
+        for name, (home, _, geometry, edge) in zip(names, made, strict=True):
+            rows[home].append((name, geometry, edge))
         if lost:
             self._keep("lanes", lost)
         if several:
@@ -493,11 +503,11 @@ class _Reader:
 
     def _level_of(self, ends: Sequence[str]) -> tuple[_Level, _Level] | None:
         """The levels of a lane's start and end."""
-        both = next((lv for lv in self.levels.values() if all(e in lv.nodes for e in ends)), None)
+        first, second = (self.homes.get(end, []) for end in ends)
+        both = next((level for level in first if ends[1] in level.nodes), None)
         if both is not None:
             return both, both
-        homes = [next((lv for lv in self.levels.values() if e in lv.nodes), None) for e in ends]
-        return None if homes[0] is None or homes[1] is None else (homes[0], homes[1])
+        return (first[0], second[0]) if first and second else None
 
     # objects
 
@@ -737,11 +747,10 @@ class _Reader:
             "plugins": properties.get("is_static") is not True,
         }
         cabin = lift.cabin
-        nodes = {anchor for lv in self.levels.values() for anchor in lv.cabins}
         rest = {
             **lift.said,
             "cabin_anchors": {
-                a: raw for a, raw in mapping(lift.said.get("cabin_anchors"), where).items() if a not in nodes
+                a: raw for a, raw in mapping(lift.said.get("cabin_anchors"), where).items() if a not in self.homes
             },
         }
         p = {
