@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import random
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -430,3 +431,29 @@ def test_the_rules_of_the_editor_find_what_it_refuses() -> None:
         ("model_instances", "error"),
         ("", "error"),
     }
+
+
+def test_members_of_other_types_are_refused_or_written_back() -> None:
+    """A reader that takes what the writer cannot use would leave a stored map that nobody gets."""
+    top = json.loads(WARD["ward.site.json"])
+    places: list[tuple[Any, Any]] = []
+    stack: list[Any] = [top]
+    while stack:
+        inner = stack.pop()
+        places += [(inner, key) for key in (inner if isinstance(inner, dict) else range(len(inner)))]
+        stack += [v for v in (inner.values() if isinstance(inner, dict) else inner) if isinstance(v, dict | list)]
+    dice = random.Random(5)
+    others = (None, 5, -1, "x", [], {}, [1], {"a": 1}, 1e300, True, {"Only": [7]}, {"1": {}})
+    refused = 0
+    for inner, key in dice.sample(places, 60):
+        was, inner[key] = inner[key], dice.choice(others)
+        try:
+            layers, _ = read({"a.site.json": json.dumps(top).encode()})
+        except UnreadableFile as error:
+            refused += 1
+            assert error.problems
+        else:
+            again, _, _ = write(layers)
+            assert again["format_version"] == "0.1"
+        inner[key] = was
+    assert 10 < refused < 60
