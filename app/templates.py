@@ -70,6 +70,7 @@ SETS: Final[Mapping[str, Set]] = {
             "lif": {"vehicle_type": "forklift"},
             "openrmf": {"speed_limit": 1.5},
             "rmf_nav_graph": {"speed_limit": 1.5},
+            "rmf_site": {"speed_limit": 1.5},
         },
     ),
     "ros2": Set(

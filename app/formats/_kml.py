@@ -66,7 +66,7 @@ RESERVED = OWN_WORDS | {
     *("kind", "name", "source", "target", "orientation", "action", "speed_limit", "width", "value", "expires"),
     *("pose", "size", "datum", "drawn_from", "data", "documents", "tags", "properties", "style", "kml", "kmz", "osm"),
     *("geojson", "tmap", "tmap2", "openrmf", "rmf_nav_graph", "gazebo", "navgraph", "nav2_route", "lif", "lanelet2"),
-    *("environment", "occupancy_grid", "octomap", "satellite", "pcd", "ply", "las", "prm", "ffr_network"),
+    *("environment", "occupancy_grid", "octomap", "satellite", "pcd", "ply", "las", "prm", "ffr_network", "rmf_site"),
 }
 """Property names that mean something to us: a drawing's own value of that name stays under ``properties.kml.data``."""
 

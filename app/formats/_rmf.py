@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
 import numpy as np
@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from app.errors import Problem, UnreadableFile
 from app.formats import WriteContext, _yaml
 from app.formats._network import natural
-from app.model.features import Properties
+from app.model.features import Features, Properties
 from app.model.frame import MAX_METRES
+from app.model.layers import Layers
 from app.parameters import parameter
 
 BUILDING, NAV_GRAPH = "openrmf", "rmf_nav_graph"
@@ -152,6 +153,51 @@ def ends(geometry: Any) -> Array:
     """float64 [2, 2]: first and last point of a line."""
     at: Array = shapely.get_coordinates(geometry)
     return at[[0, -1]]
+
+
+@dataclass(slots=True)
+class Storey:
+    """A level to be written: its parts, and what their documents say as a building."""
+
+    name: str
+    networks: list[Features] = field(default_factory=list)
+    objects: list[Features] = field(default_factory=list)
+    document: dict[str, Any] = field(default_factory=dict)
+
+
+def storeys(layers: Layers) -> list[Storey]:
+    """The levels in the order of their file; those that came from elsewhere last."""
+    found: dict[str, Storey] = {}
+    own_names = {
+        (str(p.get("kind")), str(p.get("name")))
+        for key, part in layers.vector("objects").items()
+        if key.name == BUILDING
+        for p in part.properties
+    }
+    for key, objects in layers.vector("objects").items():
+        part = objects
+        if key.name == NAV_GRAPH:  # graphs repeat the doors and lifts of the building that they were made from
+            part = part.take(
+                [k for k, p in enumerate(part.properties) if (str(p.get("kind")), str(p.get("name"))) not in own_names]
+            )
+        if key.name in (BUILDING, NAV_GRAPH) and (len(part) or BUILDING in part.document):
+            found.setdefault(key.level, Storey(key.level)).objects.append(part)
+    for key, part in layers.vector("topology").items():
+        if len(part) or BUILDING in part.document:
+            found.setdefault(key.level, Storey(key.level)).networks.append(part)
+    for storey in found.values():
+        for part in [*storey.objects, *storey.networks]:
+            said = part.document.get(BUILDING)
+            if isinstance(said, dict) and not storey.document:
+                storey.document = said
+    rank = {level.name: (level.elevation, level.name) for level in layers.levels}
+
+    def order(storey: Storey) -> tuple[bool, int, tuple[float, str]]:
+        said = storey.document.get("order")
+        known = isinstance(said, int)
+        return (not known, said if isinstance(said, int) else 0, rank.get(storey.name, (0.0, storey.name)))
+
+    return sorted(found.values(), key=order)
 
 
 @dataclass(frozen=True, slots=True)

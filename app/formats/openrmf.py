@@ -31,7 +31,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby, islice, pairwise
-from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -41,7 +40,8 @@ from numpy.typing import NDArray
 from app.errors import MissingLayer
 from app.formats import Files, Format, Needs, ReadContext, WriteContext, _openrmf_rules, _rmf, _yaml, register
 from app.formats._network import own
-from app.formats._rmf import BUILDING, NAV_GRAPH, Array, Flow, index, listing, mapping, number, refuse, value_of
+from app.formats._rmf import BUILDING, NAV_GRAPH, Array, Flow, Storey, index, listing, mapping, number, refuse, value_of
+from app.formats._rmf_images import companions_of, images, stored
 from app.formats._text import DEGREES, METRES, encoded, numbers
 from app.model.features import Features, Properties, alike, features, from_columns, points, segments, unique_ids
 from app.model.frame import GROUND, Level
@@ -270,9 +270,14 @@ def read(files: Files, context: ReadContext) -> Layers:
     if not taken:  # nothing of the network is there: a map of this format alone, and of no other
         for level in levels.values():
             parts[PartKey("topology", level.name, NAME)] = parts[PartKey("topology", level.name, NETWORK)]
-    images = _images(files, main, levels, context)
-    if images and context.wants("resources"):
-        parts[PartKey("resources", GROUND, NAME)] = Resources(images)
+    named = [
+        (f"levels.{level.name}.{place}.filename", said)
+        for level in levels.values()
+        for place, said in _named(level.said)
+    ]
+    found_images = images(files, main, named, context)
+    if found_images and context.wants("resources"):
+        parts[PartKey("resources", GROUND, NAME)] = Resources(found_images)
     parts = {key: part for key, part in parts.items() if context.wants(key.layer)}
     return Layers(parts, None, tuple(Level(level.name, level.elevation) for level in levels.values()))
 
@@ -554,41 +559,6 @@ def _ring(at: Array) -> Any:
 _FILENAME = re.compile(
     rb"\bfilename[\"']?[ \t]*:[ \t]*(?:\"([^\"\n]{1,500})\"|'([^'\n]{1,500})'|([^\s,}#\"'][^,}#\n]{0,500}))"
 )
-_ELSEWHERE = re.compile(r"^[A-Za-z]:|^[/~\\]|^\$|://|\\")
-
-
-def companions(main: str, data: bytes, names: Sequence[str]) -> Iterable[str]:
-    """The images that a building names."""
-    said = {(a or b or c).decode("utf-8", "replace").strip() for a, b, c in _FILENAME.findall(data)}
-    known = _by_base(names)
-    found = (_find(name, main, known) for name in sorted(said) if name)
-    return [name for name in dict.fromkeys(found) if name]
-
-
-def _plain(said: str) -> str | None:
-    """The name as a safe path below the building's folder, or None where it leads elsewhere."""
-    path = PurePosixPath(said)
-    return None if _ELSEWHERE.search(said) or ".." in path.parts or not path.name else str(path)
-
-
-def _base(said: str) -> str:
-    return said.replace("\\", "/").rpartition("/")[2]
-
-
-def _by_base(names: Iterable[str]) -> dict[str, list[str]]:
-    """The files by their base names."""
-    out: dict[str, list[str]] = {}
-    for name in sorted(names):
-        out.setdefault(_base(name), []).append(name)
-    return out
-
-
-def _find(said: str, main: str, known: Mapping[str, Sequence[str]]) -> str | None:
-    """The file of the upload that a building means: beside it, else the first of that base name."""
-    found = known.get(_base(said), ())
-    folder = main.rpartition("/")[0]
-    beside = [f"{folder}/{name}" if folder else name for name in (_plain(said), _base(said)) if name]
-    return next((name for name in beside if name in found), found[0] if found else None)
 
 
 def _named(said: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
@@ -602,38 +572,7 @@ def _named(said: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
             yield f"layers.{name}", layer["filename"]
 
 
-def _images(files: Files, main: str, levels: Mapping[str, _Level], context: ReadContext) -> dict[str, bytes]:
-    """The images by the path that the served building names them with."""
-    out: dict[str, bytes] = {}
-    known = _by_base(files)
-    for level in levels.values():
-        for place, said in _named(level.said):
-            if not said:
-                continue
-            where = f"levels.{level.name}.{place}.filename"
-            found = _find(said, main, known)
-            if found is None:
-                context.warn(f"the image {said[:200]!r} is not in the upload: the map is read without it", where=where)
-                continue
-            name = _plain(said)
-            if name is None:
-                name = _base(said)
-                context.warn(f"the image {said[:200]!r} is of another machine: {found} is taken", where=where)
-            out[name] = files[found]
-    return out
-
-
 # --- writing ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(slots=True)
-class _Storey:
-    """A level to be written: its parts, and what their documents say."""
-
-    name: str
-    networks: list[Features] = field(default_factory=list)
-    objects: list[Features] = field(default_factory=list)
-    document: dict[str, Any] = field(default_factory=dict)
 
 
 class _RewriteError(Exception):
@@ -645,7 +584,7 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
 
     Raises MissingLayer where there is neither a network nor anything that came from a building.
     """
-    storeys = _storeys(layers)
+    storeys = _rmf.storeys(layers)
     if not storeys:
         raise MissingLayer("openrmf needs a network: upload a building.yaml, tmap2 or OSM file")
     resources: dict[str, bytes] = {}
@@ -668,41 +607,6 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
         return files
     except _RewriteError as changed:
         return _Writer(layers, context, storeys, known[0], METRIC, resources, str(changed)).files()
-
-
-def _storeys(layers: Layers) -> list[_Storey]:
-    """The levels in the order of their file; those that came from elsewhere last."""
-    found: dict[str, _Storey] = {}
-    own_names = {
-        (str(p.get("kind")), str(p.get("name")))
-        for key, part in layers.vector("objects").items()
-        if key.name == NAME
-        for p in part.properties
-    }
-    for key, objects in layers.vector("objects").items():
-        part = objects
-        if key.name == NAV_GRAPH:  # graphs repeat the doors and lifts of the building that they were made from
-            part = part.take(
-                [k for k, p in enumerate(part.properties) if (str(p.get("kind")), str(p.get("name"))) not in own_names]
-            )
-        if key.name in (NAME, NAV_GRAPH) and (len(part) or NAME in part.document):
-            found.setdefault(key.level, _Storey(key.level)).objects.append(part)
-    for key, part in layers.vector("topology").items():
-        if len(part) or NAME in part.document:
-            found.setdefault(key.level, _Storey(key.level)).networks.append(part)
-    for storey in found.values():
-        for part in [*storey.objects, *storey.networks]:
-            said = part.document.get(NAME)
-            if isinstance(said, dict) and not storey.document:
-                storey.document = said
-    rank = {level.name: (level.elevation, level.name) for level in layers.levels}
-
-    def order(storey: _Storey) -> tuple[bool, int, tuple[float, str]]:
-        said = storey.document.get("order")
-        known = isinstance(said, int)
-        return (not known, said if isinstance(said, int) else 0, rank.get(storey.name, (0.0, storey.name)))
-
-    return sorted(found.values(), key=order)
 
 
 Sections = dict[str, list[str]]
@@ -750,7 +654,7 @@ class _Writer:
         self,
         layers: Layers,
         context: WriteContext,
-        storeys: Sequence[_Storey],
+        storeys: Sequence[Storey],
         building: Mapping[str, Any],
         system: str,
         resources: Mapping[str, bytes],
@@ -774,7 +678,7 @@ class _Writer:
         said = self.building.get("reference_level_name")
         self.reference = _text(said) if _text(said) in self.transforms else storeys[0].name
 
-    def _transform(self, storey: _Storey) -> Transform:
+    def _transform(self, storey: Storey) -> Transform:
         said = storey.document.get("transform")
         if self.system != IMAGE or not isinstance(said, list) or len(said) != 4:
             return Transform()
@@ -852,13 +756,13 @@ class _Writer:
 
     # levels
 
-    def _elevation(self, storey: _Storey) -> Any:
+    def _elevation(self, storey: Storey) -> Any:
         """As the level says it, unless the environment knows better."""
         said = mapping(storey.document.get("level"), "level").get("elevation", 0.0)
         known = next((level.elevation for level in self.layers.levels if level.name == storey.name), None)
         return said if known is None or said == known else known
 
-    def _level(self, storey: _Storey) -> list[str]:
+    def _level(self, storey: Storey) -> list[str]:
         """The level's lines, in pieces."""
         rest = dict(mapping(storey.document.get("level"), "level"))
         if self.converted:
@@ -884,7 +788,7 @@ class _Writer:
     def _drawings(self, rest: dict[str, Any], level: str) -> None:
         """Take along the images that the level names, under names that stay below the building's folder."""
         for place, said in list(_named(rest)):
-            name = next((n for n in (_plain(said), _base(said)) if n in self.resources), None)
+            name = stored(said, self.resources)
             if name is None:
                 if said:
                     problem = f"the image {said[:200]!r} was not in the upload: it is named and not served"
@@ -898,7 +802,7 @@ class _Writer:
                 else:
                     rest[outer] = {**rest[outer], "filename": name}
 
-    def _nodes(self, storey: _Storey) -> tuple[_Vertices, dict[str, int]]:
+    def _nodes(self, storey: Storey) -> tuple[_Vertices, dict[str, int]]:
         """The nodes as vertices in their old order, and each id's place among them."""
         elevation = float(self._elevation(storey))
         found: list[tuple[tuple[bool, int, int, str], str]] = []
@@ -949,7 +853,7 @@ class _Writer:
 
     # lanes
 
-    def _lanes(self, storey: _Storey, ids: Mapping[str, int]) -> Iterator[str]:
+    def _lanes(self, storey: Storey, ids: Mapping[str, int]) -> Iterator[str]:
         """The edges as lanes: those of one lane, or opposite ones that say the same, as one two-way lane."""
         for _, lanes in groupby(self._edges(storey, ids), key=lambda lane: lane.was):
             waiting: dict[Any, list[_Lane]] = {}
@@ -965,7 +869,7 @@ class _Writer:
             for lane in out:
                 yield lane.row(self.flow)
 
-    def _edges(self, storey: _Storey, ids: Mapping[str, int]) -> Iterator[_Lane]:
+    def _edges(self, storey: Storey, ids: Mapping[str, int]) -> Iterator[_Lane]:
         """The level's edges, in the order of the lanes that they were."""
         for _, p, bends in _in_order(storey.networks):
             source, target = ids.get(str(p.get("source"))), ids.get(str(p.get("target")))
@@ -985,7 +889,7 @@ class _Writer:
             limit = _rmf.limit(p) or (self.options.speed_limit if NAME not in p and NAV_GRAPH not in p else 0.0)
             yield _Lane.of(limit, rest, source, target, self.flow)
 
-    def _dangling(self, storey: _Storey, vertices: _Vertices, sections: Sections) -> None:
+    def _dangling(self, storey: Storey, vertices: _Vertices, sections: Sections) -> None:
         """Rows to vertices that did not exist come back where they still do not."""
         for section, rows in mapping(storey.document.get("dangling"), "dangling").items():
             for row in rows:
@@ -999,7 +903,7 @@ class _Writer:
 
     # objects
 
-    def _objects(self, storey: _Storey, vertices: _Vertices, sections: Sections) -> None:
+    def _objects(self, storey: Storey, vertices: _Vertices, sections: Sections) -> None:
         sections_of = {kind: section for section, kind in {**LINES, **RINGS}.items()}
         found: dict[str, list[tuple[tuple[bool, int, str], str]]] = {}
         scaling = Scaling([], [])
@@ -1078,7 +982,7 @@ class _Writer:
             corners = [vertices.at(place, hint) for place, hint in zip(ring, known, strict=True)]
             yield self.flow({**said, "vertices": corners})
 
-    def _model(self, p: Properties, place: tuple[str, str], storey: _Storey) -> str:
+    def _model(self, p: Properties, place: tuple[str, str], storey: Storey) -> str:
         rest = dict(mapping(own(p, NAME).get("says"), "says"))
         pose = _rmf.pose_of(p)
         if pose is not None and not self.degrees:
@@ -1181,7 +1085,7 @@ def _in_order(parts: Sequence[Features]) -> Iterable[tuple[str, Properties, int]
     return each() if all(a <= b for a, b in pairwise(map(key, each()))) else sorted(each(), key=key)
 
 
-def _nodes_of(storeys: Iterable[_Storey]) -> Iterator[tuple[str, str, Properties]]:
+def _nodes_of(storeys: Iterable[Storey]) -> Iterator[tuple[str, str, Properties]]:
     for storey in storeys:
         for part in storey.networks:
             for i, p in zip(part.ids, part.properties, strict=True):
@@ -1303,7 +1207,7 @@ register(
         check=_openrmf_rules.check,
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
-        companions=companions,
+        companions=companions_of(_FILENAME),
         family=NAME,
         rank=40,
         write_options=_rmf.WriteOptions,

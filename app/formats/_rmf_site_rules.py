@@ -1,0 +1,142 @@
+"""What Open-RMF's site editor wants of a site: members without a default, ids that are there, and known versions.
+
+Source: open-rmf/rmf_site, crates/rmf_site_format (serde's attributes of each struct; nav_graph.rs for the export).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from app.errors import Problem
+from app.formats import Files, _json, _ron
+from app.formats._rules import LIMITS, brief, doubted, is_number, missing, names, numbers, refused, repeated, shown
+
+REQUIRED: Mapping[str, tuple[str, ...]] = {
+    "doors": ("anchors", "name", "kind"),
+    "walls": ("anchors",),
+    "floors": ("anchors",),
+    "drawings": ("properties",),
+    "lanes": ("anchors", "graphs"),
+    "locations": ("anchor", "tags", "name", "graphs"),
+    "lifts": ("cabin_doors", "properties", "cabin_anchors"),
+    "model_instances": ("parent", "name", "pose", "description"),
+}
+
+
+def check(files: Files) -> Iterator[Problem]:
+    """A site as its editor loads it."""
+    main = next(iter(files))
+    if brief(files[main]):
+        return
+    top = _ron.load(files[main], LIMITS) if main.endswith(".ron") else _json.load(files[main], LIMITS)
+    if not isinstance(top, dict):
+        yield refused("a site is a mapping", main)
+        return
+    version = top.get("format_version")
+    if not isinstance(version, str) or not version.startswith("0.") or not version[2:].isdigit():
+        yield refused(f'must be "0.MINOR", is {shown(version)}', main, where="format_version")
+    properties = top.get("properties")
+    if not isinstance(properties, dict) or not isinstance(properties.get("name"), str):
+        yield refused("a site needs a name", main, where="properties.name")
+    elif (offset := properties.get("geographic_offset")) is not None:
+        if lost := missing(offset, ("anchor", "zoom", "visible")):
+            yield refused(f"needs {', '.join(lost)}", main, where="properties.geographic_offset")
+        elif not numbers(offset["anchor"], 2, 2) or abs(offset["anchor"][0]) > 84:
+            reason = "must be [latitude, longitude] within the zones of UTM (80° S to 84° N)"
+            yield refused(reason, main, where="properties.geographic_offset.anchor")
+    yield from _site(top, main)
+
+
+def _section(said: Any, section: str, main: str, where: str) -> Iterator[Problem]:
+    """Elements that lack a member."""
+    for i, one in _elements(said):
+        if lost := missing(one, REQUIRED[section]):
+            yield refused(f"needs {', '.join(lost)}", main, where=f"{where}.{i}")
+
+
+def _elements(said: Any) -> list[tuple[str, Any]]:
+    return list(said.items()) if isinstance(said, dict) else []
+
+
+def _site(top: Mapping[str, Any], main: str) -> Iterator[Problem]:
+    levels = _elements(top.get("levels"))
+    if not levels:
+        yield refused("a site needs a level", main, where="levels")
+    site = {i for i, _ in _elements(top.get("anchors"))}
+    ids = list(site)
+    known = set(site)
+    for i, level in levels:
+        where = f"levels.{i}"
+        properties = level.get("properties") if isinstance(level, dict) else None
+        if not isinstance(properties, dict) or not is_number(properties.get("elevation")) or "name" not in properties:
+            yield refused("needs a name and an elevation", main, where=f"{where}.properties")
+            continue
+        here = {a for a, _ in _elements(level.get("anchors"))}
+        ids += [i, *here]
+        known |= here
+        for section in ("doors", "walls", "floors", "drawings"):
+            yield from _section(level.get(section), section, main, f"{where}.{section}")
+            ids += [key for key, _ in _elements(level.get(section))]
+        for section in ("doors", "walls", "floors"):
+            yield from _stands(level.get(section), here | site, main, f"{where}.{section}")
+    if again := repeated(level["properties"].get("name") for _, level in levels if _is_named(level)):
+        yield doubted(f"levels with the same name: {names(again)}", main, where="levels")
+    for i, lift in _elements(top.get("lifts")):
+        yield from _section({i: lift}, "lifts", main, "lifts")
+        cabin = {a for a, _ in _elements(lift.get("cabin_anchors"))} if isinstance(lift, dict) else set()
+        ids += [i, *cabin]
+        known |= cabin
+        properties = lift.get("properties") if isinstance(lift, dict) else None
+        yield from _stands({i: _ends(properties)}, site, main, "lifts")
+    yield from _navigation(top.get("navigation"), known, ids, main)
+    yield from _section(top.get("model_instances"), "model_instances", main, "model_instances")
+    described = {i for i, _ in _elements(top.get("model_descriptions"))}
+    lost = [
+        i
+        for i, one in _elements(top.get("model_instances"))
+        if isinstance(one, dict) and one.get("description") is not None and str(one["description"]) not in described
+    ]
+    if lost:
+        yield refused(f"no description of the models {names(lost)}", main, where="model_instances")
+    if again := repeated(ids):
+        yield refused(f"ids that several elements have: {names(again)}", main)
+
+
+def _is_named(level: Any) -> bool:
+    return isinstance(level, dict) and isinstance(level.get("properties"), dict)
+
+
+def _ends(properties: Any) -> dict[str, Any]:
+    return {"anchors": properties.get("reference_anchors")} if isinstance(properties, dict) else {}
+
+
+def _stands(said: Any, anchors: set[str], main: str, where: str) -> Iterator[Problem]:
+    """Elements on anchors that are not there."""
+    lost = [
+        i
+        for i, one in _elements(said)
+        if isinstance(one, dict) and any(str(a) not in anchors for a in one.get("anchors") or ())
+    ]
+    if lost:
+        yield refused(f"{names(lost)} stand on anchors that are not there", main, where=where)
+
+
+def _navigation(said: Any, anchors: set[str], ids: list[str], main: str) -> Iterator[Problem]:
+    guided = said.get("guided") if isinstance(said, dict) else None
+    if not isinstance(guided, dict):
+        return
+    where = "navigation.guided"
+    if lost := missing(guided, ("graphs", "ranking", "lanes", "locations")):
+        yield refused(f"needs {', '.join(lost)}", main, where=where)
+    for section in ("lanes", "locations"):
+        yield from _section(guided.get(section), section, main, f"{where}.{section}")
+        ids += [i for i, _ in _elements(guided.get(section))]
+    yield from _stands(guided.get("lanes"), anchors, main, f"{where}.lanes")
+    places = {
+        i: {"anchors": [one.get("anchor")]} for i, one in _elements(guided.get("locations")) if isinstance(one, dict)
+    }
+    yield from _stands(places, anchors, main, f"{where}.locations")
+    called = [one.get("name") for _, one in _elements(guided.get("locations")) if isinstance(one, dict)]
+    if again := repeated(name for name in called if name and name != "<Unnamed>"):
+        yield doubted(f"locations with the same name: {names(again)}", main, where=f"{where}.locations")

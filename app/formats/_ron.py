@@ -1,0 +1,328 @@
+"""RON (Rusty Object Notation) as the values that JSON would have, and back.
+
+Reading: structs and maps become mappings (their keys texts), sequences and tuples lists, ``Some(v)`` is v, ``None`` and
+``()`` are None, a unit variant is its name as a text, ``Variant(v)`` is ``{"Variant": v}``, and so are structs with a
+name; one value in brackets without a comma (a newtype) is the value itself. So a site saved as RON reads as its JSON.
+
+Writing asks a ``Shape`` what JSON does not tell: which lists are tuples, which texts are variants. The file begins with
+the extensions that let options and newtypes stand without ``Some`` and brackets.
+
+Source: ron-rs/ron, docs/grammar.md and docs/extensions.md.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from app.errors import Problem, TooLarge, UnreadableFile
+from app.formats import Limits
+
+MAX_DEPTH = 96
+"""Nested values; sites have about fifteen."""
+
+EXTENSIONS = "#![enable(implicit_some, unwrap_newtypes)]"
+
+_TOKEN = re.compile(
+    r"(?P<space>[ \t\r\n]+|//[^\n]*)"
+    r"|(?P<comment>/\*)"
+    r"|(?P<raw>b?r(?P<hashes>#{0,255})\")"
+    r"|(?P<text>b?\"(?:[^\"\\]|\\.)*\")"
+    r"|(?P<character>b?'(?:[^'\\\n]|\\[^\n]+?)')"
+    r"|(?P<number>[-+]?(?:0[xX][0-9a-fA-F_]+|0[bB][01_]+|0[oO][0-7_]+|(?:[0-9][0-9_]*(?:\.[0-9_]*)?|\.[0-9][0-9_]*)"
+    r"(?:[eE][-+]?[0-9_]+)?)(?:[iu](?:8|16|32|64|128)|f32|f64)?|[-+](?:inf|NaN))"
+    r"|(?P<word>r#[A-Za-z0-9_.+-]+|[^\W\d]\w*)"
+    r"|(?P<mark>[()\[\]{},:])",
+    re.DOTALL,
+)
+_ATTRIBUTE = re.compile(r"#!\[\s*enable\s*\(([^()\[\]]*)\)\s*\]")
+_COMMENT = re.compile(r"/\*|\*/")
+_FIELD = re.compile(r"(?:\s|//[^\n]*\n)*:")
+_SUFFIX = re.compile(r"(?:[iu](?:8|16|32|64|128)|f32|f64)$")
+_ESCAPE = re.compile(r"\\(?:u\{([0-9a-fA-F]{1,6})\}|x([0-9a-fA-F]{2})|(\r?\n\s*)|(.))", re.DOTALL)
+_PLAIN = {"n": "\n", "r": "\r", "t": "\t", "0": "\0", "\\": "\\", '"': '"', "'": "'"}
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_CLOSING = {"(": ")", "[": "]", "{": "}"}
+_WORDS: Mapping[str, Any] = {"true": True, "false": False, "None": None}
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+def load(data: bytes, limits: Limits) -> Any:
+    """The value of a RON text. Raises UnreadableFile with line, or TooLarge."""
+    if len(data) > limits.text_bytes:
+        raise TooLarge(f"the file has {len(data)} bytes; the limit for a text is {limits.text_bytes}")
+    return _Parser(data.removeprefix(b"\xef\xbb\xbf").decode("utf-8"), limits).document()
+
+
+class _Parser:
+    """One text being read, a token ahead."""
+
+    def __init__(self, text: str, limits: Limits) -> None:
+        self._text, self._limits = text, limits
+        self._at, self._left = 0, limits.yaml_nodes
+        self._kind, self._value, self._start = "", "", 0
+
+    def document(self) -> Any:
+        """The only value of the text."""
+        self._space()
+        while found := _ATTRIBUTE.match(self._text, self._at):
+            self._at = found.end()
+            self._space()
+        self._next()
+        out = self._any(0)
+        if self._kind != "end":
+            self._fail("something stands behind the value")
+        return out
+
+    def _fail(self, reason: str) -> NoReturn:
+        line = self._text.count("\n", 0, self._start) + 1
+        said = f"not RON: {reason}"
+        raise UnreadableFile(f"line {line}: {said}", [Problem(said, line=line)])
+
+    def _space(self) -> None:
+        """Skip blanks and comments; those between ``/*`` and ``*/`` may be nested."""
+        while (found := _TOKEN.match(self._text, self._at)) and found.lastgroup in ("space", "comment"):
+            self._at = found.end()
+            if found.lastgroup == "comment":
+                self._start, depth = found.start(), 1
+                for mark in _COMMENT.finditer(self._text, self._at):
+                    depth += 1 if mark.group() == "/*" else -1
+                    if not depth:
+                        self._at = mark.end()
+                        break
+                else:
+                    self._fail("a comment does not end")
+
+    def _next(self) -> None:
+        self._space()
+        self._start = self._at
+        if self._at >= len(self._text):
+            self._kind, self._value = "end", ""
+            return
+        found = _TOKEN.match(self._text, self._at)
+        if found is None:
+            self._fail(f"{self._text[self._at : self._at + 20]!r} is no part of a value")
+        self._kind, self._value, self._at = str(found.lastgroup), found.group(), found.end()
+        if found["raw"] is not None:
+            closing = '"' + found["hashes"]
+            end = self._text.find(closing, self._at)
+            if end < 0:
+                self._fail("a raw text does not end")
+            self._kind, self._value, self._at = "raw", self._text[self._at : end], end + len(closing)
+
+    def _is(self, mark: str) -> bool:
+        return self._kind == "mark" and self._value == mark
+
+    def _take(self, mark: str) -> None:
+        if not self._is(mark):
+            self._fail(f"{mark!r} is missing before {self._value[:20]!r}" if self._value else f"{mark!r} is missing")
+        self._next()
+
+    def _any(self, depth: int) -> Any:
+        """One value."""
+        self._left -= 1
+        if depth > MAX_DEPTH:
+            self._fail(f"nested deeper than {MAX_DEPTH}")
+        if self._left < 0:
+            raise TooLarge(f"the file has more than {self._limits.yaml_nodes} values")
+        if self._kind == "mark" and self._value in _CLOSING:
+            read = {"(": self._brackets, "[": self._sequence, "{": self._map}[self._value]
+            return read(depth)
+        if self._kind == "word":
+            return self._word(depth)
+        return self._scalar()
+
+    def _scalar(self) -> Any:
+        kind, value = self._kind, self._value
+        if kind in ("text", "character", "raw"):
+            out: Any = value if kind == "raw" else self._unescaped(value)
+        elif kind == "number":
+            out = self._number(value)
+        else:
+            self._fail("a value is missing" if kind == "end" else f"a value is missing before {value[:20]!r}")
+        self._next()
+        return out
+
+    def _number(self, said: str) -> int | float:
+        bare = said if said[:3].lower().lstrip("+-").startswith("0x") else _SUFFIX.sub("", said)
+        bare = bare.replace("_", "")
+        try:
+            out: int | float = int(bare, 0) if re.fullmatch(r"[-+]?(?:0[xXbBoO].+|\d{1,20})", bare) else float(bare)
+        except ValueError:
+            try:
+                out = int(bare, 10)
+            except ValueError:
+                self._fail(f"{said[:40]!r} is no number")
+        if not math.isfinite(out):
+            self._fail(f"the number {said[:40]!r} is not finite")
+        return float(out) if isinstance(out, int) and not -(2**63) <= out < 2**63 else out
+
+    def _unescaped(self, said: str) -> str:
+        said = said.removeprefix("b")[1:-1]
+        if "\\" not in said:
+            return said
+
+        def one(found: re.Match[str]) -> str:
+            code = found[1] or found[2]
+            if code is not None:
+                point = int(code, 16)
+                if point > 0x10FFFF or 0xD800 <= point <= 0xDFFF:
+                    self._fail(f"{found.group()!r} is no character")
+                return chr(point)
+            if found[3] is not None:
+                return ""
+            if found[4] not in _PLAIN:
+                self._fail(f"unknown escape {found.group()!r}")
+            return _PLAIN[found[4]]
+
+        return _ESCAPE.sub(one, said)
+
+    def _word(self, depth: int) -> Any:
+        """A word of the language, or a variant or struct with what belongs to it."""
+        name = self._value.removeprefix("r#")
+        if name in ("inf", "NaN", "inff32", "inff64"):
+            self._fail(f"the number {name!r} is not finite")
+        self._next()
+        if not self._is("("):
+            return _WORDS.get(name, name)
+        content = self._brackets(depth)
+        return content if name == "Some" else {name: content}
+
+    def _brackets(self, depth: int) -> Any:
+        """A struct, a tuple, a newtype or nothing."""
+        self._take("(")
+        if self._is(")"):
+            self._next()
+            return None
+        if self._kind == "word" and _FIELD.match(self._text, self._at):
+            return self._pairs(depth, ")")
+        out = [self._any(depth + 1)]
+        if self._is(")"):
+            self._next()
+            return out[0]
+        while not self._is(")"):
+            self._take(",")
+            if not self._is(")"):
+                out.append(self._any(depth + 1))
+        self._next()
+        return out
+
+    def _sequence(self, depth: int) -> list[Any]:
+        self._take("[")
+        out: list[Any] = []
+        while not self._is("]"):
+            out.append(self._any(depth + 1))
+            if not self._is("]"):
+                self._take(",")
+        self._next()
+        return out
+
+    def _map(self, depth: int) -> dict[str, Any]:
+        self._take("{")
+        return self._pairs(depth, "}")
+
+    def _pairs(self, depth: int, closing: str) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        while not self._is(closing):
+            start = self._start
+            key = self._key()
+            if key in out:
+                self._start = start
+                self._fail(f"{key[:60]!r} stands twice")
+            self._take(":")
+            out[key] = self._any(depth + 1)
+            if not self._is(closing):
+                self._take(",")
+        self._next()
+        return out
+
+    def _key(self) -> str:
+        if self._kind == "word":
+            name = self._value.removeprefix("r#")
+            self._next()
+            return name
+        key = self._scalar()
+        return key if isinstance(key, str) else str(key)
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What a schema says of values beyond JSON.
+
+    tuples: names of members whose lists have a fixed length. variants: names of enum variants that hold a value.
+    units: member -> its texts that are variants, also in lists. maps: members whose mapping has variants as keys.
+    free: members so many mappings below which all is plain JSON.
+    """
+
+    tuples: frozenset[str]
+    variants: frozenset[str]
+    units: Mapping[str, frozenset[str]]
+    maps: frozenset[str]
+    free: Mapping[str, int]
+
+
+def dump(value: Any, shape: Shape) -> bytes:
+    """The value as RON, two blanks for each level; what ``load`` reads as the same value."""
+    return (f"{EXTENSIONS}\n" + "".join(_written(value, "", shape, 0, None)) + "\n").encode()
+
+
+def _written(value: Any, member: str, shape: Shape, depth: int, left: int | None) -> Iterator[str]:
+    """The pieces of one value. member: the name it stands under; left: mappings until all is plain JSON, if at all."""
+    known = left != 0
+    if isinstance(value, dict):
+        yield from _mapping(value, member, shape, depth, shape.free.get(member) if left is None else left)
+    elif isinstance(value, (list, tuple)):
+        as_tuple = known and member in shape.tuples and len(value) > 1
+        yield "(" if as_tuple else "["
+        for k, item in enumerate(value):
+            yield ", " if k else ""
+            yield from _written(item, member, shape, depth, left)
+        yield ")" if as_tuple else "]"
+    elif known and isinstance(value, str) and value in shape.units.get(member, ()):
+        yield value
+    else:
+        yield _scalar(value)
+
+
+def _mapping(value: Mapping[str, Any], member: str, shape: Shape, depth: int, left: int | None) -> Iterator[str]:
+    known = left != 0
+    if known and len(value) == 1 and (name := next(iter(value))) in shape.variants:
+        yield f"{name}("
+        yield from _written(value[name], name, shape, depth, left)
+        yield ")"
+        return
+    named = known and bool(value) and all(_IDENTIFIER.fullmatch(k) and k not in _WORDS for k in value)
+    struct = named and member not in shape.maps
+    begin = "\n" + "  " * (depth + 1)
+    yield "(" if struct else "{"
+    for key, item in value.items():
+        yield f"{begin}{key if named or (known and _WHOLE.fullmatch(key)) else _scalar(key)}: "
+        yield from _written(item, key, shape, depth + 1, left - 1 if left else left)
+        yield ","
+    if value:
+        yield "\n" + "  " * depth
+    yield ")" if struct else "}"
+
+
+_WHOLE = re.compile(r"0|[1-9][0-9]{0,9}")
+_ESCAPED = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\r": "\\r", "\t": "\\t"}
+
+
+def _character(c: str) -> str:
+    return _ESCAPED.get(c) or (c if c >= " " and c != "\x7f" else f"\\u{{{ord(c):x}}}")
+
+
+def _scalar(value: Any) -> str:
+    if value is None:
+        return "None"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return '"' + "".join(map(_character, value)) + '"' if isinstance(value, str) else repr(value)

@@ -1,0 +1,884 @@
+"""map.site.json, map.site.ron: the sites of Open-RMF's site editor, which takes the place of traffic editor's building.
+
+A site has levels with anchors (places in metres), and walls, doors, floors and drawings on them; lifts, whose cabins
+have anchors of their own; models; and, for all levels together, the navigation graphs with lanes and locations.
+Releases of the editor up to 2024 wrote RON, later ones write JSON; both are read, and members that only the older
+ones have. ``geographic_offset`` is the latitude and longitude of (0, 0), whose +y axis the editor takes as UTM's north.
+
+Canonical: as a building (``app.formats.openrmf``), in its words, so that either format is written from the other, and
+navigation graphs from both. An anchor is a node unless only walls, doors or floors stand on it, called by its location,
+else ``<level>/<id>``; an anchor in a lift's cabin is a node on each level from which a lane leads to it. A lane is an
+edge there and, unless its reverse is disabled, one back. What only a site says of an item stands in its
+``properties.rmf_site``, of a level and of the site in the documents' ``rmf_site``: ``{site, level, order}``.
+
+Source: open-rmf/rmf_site, crates/rmf_site_format; crates/rmf_site_editor/src/site (lift.rs, georeference.rs, save.rs).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.formats import Files, Format, Needs, ReadContext, _json, _rmf, _rmf_site, _rmf_site_rules, _ron, register
+from app.formats._network import number
+from app.formats._rmf import BUILDING, NAV_GRAPH, Array, mapping, refuse
+from app.formats._rmf_images import companions_of, images
+from app.formats._rmf_site import (
+    NAME,
+    UNNAMED,
+    Cabin,
+    by_id,
+    elements,
+    place,
+    reference,
+    references,
+    text,
+    unknown,
+    variant,
+)
+from app.formats._rmf_site_writing import FILE, FILE_RON, WriteOptions, write
+from app.model.features import Features, Properties, features, points, segments, unique_ids
+from app.model.frame import GROUND, Datum, Level
+from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
+
+_VERSION = re.compile(r"(\d{1,6})\.(\d{1,6})")
+_TAGS: Mapping[str, str] = {
+    "Charger": "is_charger",
+    "ParkingSpot": "is_parking_spot",
+    "HoldingPoint": "is_holding_point",
+}
+_ORIENTATIONS: Mapping[str, str] = {"Forwards": "forward", "Backwards": "backward"}
+_LISTS = frozenset({"anchors", "doors", "floors", "walls", "models", "drawings"})
+"""What of a level is items; all else of it stays in the document."""
+
+SAME_PLACE = 1e-3
+"""Metres between a robot and the location that it starts at."""
+
+
+@dataclass(slots=True)
+class _Level:
+    """A level as its file says it.
+
+    anchors: [x, y, z] by id. nodes: id of a node by its anchor. cabins: anchors in lifts that are nodes of the level.
+    """
+
+    id: str
+    name: str
+    order: int
+    said: dict[str, Any]
+    elevation: float
+    anchors: dict[str, list[float]]
+    nodes: dict[str, str] = field(default_factory=dict)
+    cabins: set[str] = field(default_factory=set)
+
+    @property
+    def where(self) -> str:
+        return f"levels.{self.id}"
+
+
+@dataclass(slots=True)
+class _Lift:
+    id: str
+    name: str
+    said: dict[str, Any]
+    cabin: Cabin
+    visits: list[str]
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """Topology and objects for each level, the drawings that were uploaded with the site, and its datum.
+
+    Raises UnreadableFile naming the place.
+    """
+    main = context.main or next(iter(files))
+    data = files[main]
+    top = _ron.load(data, context.limits) if _is_ron(main, data) else _json.load(data, context.limits)
+    if not isinstance(top, dict):
+        refuse("must be a site: a mapping with format_version and levels", "")
+    reader = _Reader(top, context)
+    parts = reader.parts()
+    found = images(files, main, list(reader.drawings()), context)
+    if found and context.wants("resources"):
+        parts[PartKey("resources", GROUND, BUILDING)] = Resources(found)
+    parts = {key: part for key, part in parts.items() if context.wants(key.layer)}
+    levels = tuple(Level(level.name, level.elevation) for level in reader.levels.values())
+    return Layers(parts, reader.datum(), levels)
+
+
+def _is_ron(name: str, data: bytes) -> bool:
+    start = data[:4096].removeprefix(b"\xef\xbb\xbf").lstrip()[:1]
+    return start in (b"(", b"#", b"/") or (start != b"{" and name.lower().endswith(".ron"))
+
+
+class _Reader:
+    """A site being read."""
+
+    def __init__(self, top: dict[str, Any], context: ReadContext) -> None:
+        self.top, self.context = top, context
+        self.strange: Counter[str] = Counter()
+        self._version()
+        self.site_anchors = self._anchors(top.get("anchors"), "anchors")
+        self.levels = self._levels()
+        guided = mapping(mapping(top.get("navigation"), "navigation").get("guided"), "navigation.guided")
+        self.guided = guided
+        where = "navigation.guided"
+        self.lanes = elements(guided.get("lanes"), f"{where}.lanes")
+        self.locations = elements(guided.get("locations"), f"{where}.locations")
+        graphs = elements(guided.get("graphs"), f"{where}.graphs")
+        self.graphs = _rmf_site.graph_numbers(graphs, references(guided.get("ranking") or [], f"{where}.ranking"))
+        self.mutexes = {
+            i: text(said.get("name"), f"{where}.mutex_groups.{i}.name")
+            for i, said in elements(guided.get("mutex_groups"), f"{where}.mutex_groups")
+        }
+        self.lifts = [self._lift(i, said) for i, said in elements(top.get("lifts"), "lifts")]
+        self.cabins = {
+            anchor: lift
+            for lift in self.lifts
+            for anchor in mapping(lift.said.get("cabin_anchors"), f"lifts.{lift.id}.cabin_anchors")
+        }
+        self.homes: dict[str, list[_Level]] = {}
+        self.textures = dict(elements(top.get("textures"), "textures"))
+        self.groups = dict(elements(top.get("fiducial_groups"), "fiducial_groups"))
+        self.descriptions = dict(elements(top.get("model_descriptions"), "model_descriptions"))
+        self.robots = dict(elements(top.get("robots"), "robots"))
+        for i, scenario in elements(top.get("scenarios"), "scenarios"):
+            mapping(scenario.get("instances"), f"scenarios.{i}.instances")
+        self.dangling: dict[str, dict[str, Any]] = {}
+        self.placed = self._placed()
+        for section in ("", "properties", "navigation"):
+            self._look(mapping(top.get(section), section) if section else top, section)
+        self._look(guided, "navigation.guided")
+
+    # what stands where
+
+    def _version(self) -> None:
+        said = self.top.get("format_version")
+        found = _VERSION.fullmatch(said) if isinstance(said, str) else None
+        if found is None:
+            refuse(f'must be a text "major.minor", is {str(said)[:40]!r}', "format_version")
+        if int(found[1]) > 0:
+            refuse(
+                f"version {said} is not supported, only 0.x: save the site with a release that writes 0.x",
+                "format_version",
+            )
+
+    def _look(self, said: Mapping[str, Any], section: str) -> None:
+        """Count members that no release has."""
+        for member in unknown(said, section):
+            self.strange[f"{section}: {member[:60]}" if section else member[:60]] += 1
+
+    def _anchors(self, said: Any, where: str) -> dict[str, list[float]]:
+        return {key: place(raw, "General", f"{where}.{key}") for key, raw in by_id(said, where)}
+
+    def _levels(self) -> dict[str, _Level]:
+        listed = elements(self.top.get("levels"), "levels")
+        if not listed:
+            refuse("a site needs at least one level", "levels")
+        if self.context.level != GROUND:
+            problem = f"its levels have names of their own: level={self.context.level} is not used"
+            self.context.warn(problem, where="levels")
+        properties = [mapping(said.get("properties"), f"levels.{i}.properties") for i, said in listed]
+        wanted = []
+        for (i, said), p in zip(listed, properties, strict=True):
+            self._look(said, "levels")
+            self._look(p, "levels.properties")
+            wanted.append(_rmf.short(text(p.get("name"), f"levels.{i}.properties.name")) or f"level {i}")
+        names = unique_ids(wanted)
+        if twice := sorted({a for a, b in zip(wanted, names, strict=True) if a != b}):
+            self.context.warn(f"levels have the same name: {', '.join(twice[:5])}; they get a number", where="levels")
+        return {
+            i: _Level(
+                i,
+                name,
+                order,
+                said,
+                number(p.get("elevation", 0.0), f"levels.{i}.properties.elevation"),
+                self._anchors(said.get("anchors"), f"levels.{i}.anchors"),
+            )
+            for order, ((i, said), p, name) in enumerate(zip(listed, properties, names, strict=True))
+        }
+
+    def datum(self) -> Datum | None:
+        """The place on earth of (0, 0); a warning where it is not the environment's."""
+        said = mapping(self.top.get("properties"), "properties").get("geographic_offset")
+        where = "properties.geographic_offset"
+        if said is None:
+            return None
+        latitude, longitude = _rmf_site.vector(mapping(said, where).get("anchor"), 2, f"{where}.anchor")
+        known = self.context.frame.datum if self.context.frame is not None else None
+        if known is None:
+            return Datum(latitude, longitude)
+        near = abs(known.latitude - latitude) < 1e-5 and abs(known.longitude - longitude) < 1e-5
+        if not near:  # the editor keeps single precision: a metre or so
+            self.context.warn(
+                f"its place {latitude!r}, {longitude!r} is not the environment's datum {known.latitude!r}, "
+                f"{known.longitude!r}, which stays: change the environment's datum, or the site",
+                where=where,
+            )
+        return None
+
+    def _lift(self, i: str, said: dict[str, Any]) -> _Lift:
+        where = f"lifts.{i}"
+        self._look(said, "lifts")
+        properties = mapping(said.get("properties"), f"{where}.properties")
+        ends = references(properties.get("reference_anchors"), f"{where}.properties.reference_anchors", 2)
+        at = []
+        for anchor in ends:
+            raw = mapping(self.top.get("anchors"), "anchors").get(anchor)
+            if raw is None:
+                refuse(f"there is no anchor {anchor} of the site", f"{where}.properties.reference_anchors")
+            at.append(place(raw, "Lift", f"anchors.{anchor}"))
+        name = _rmf.short(text(properties.get("name"), f"{where}.properties.name")) or f"lift {i}"
+        visits: list[str] = []
+        for key, door in elements(said.get("cabin_doors"), f"{where}.cabin_doors"):
+            visits += references(door.get("visits", []), f"{where}.cabin_doors.{key}.visits")
+        served = [level for level in self.levels if level in visits]
+        cabin = _rmf_site.cabin_of(properties, at[0], at[1], f"{where}.properties")
+        return _Lift(i, name, said, cabin, served)
+
+    # the parts
+
+    def parts(self) -> dict[PartKey, Part]:
+        """A network and objects for each level."""
+        taken: set[str] = set()
+        networks = self._networks(taken)
+        lifts: dict[str, list[tuple[str, Any, Properties]]] = {}
+        for k, lift in enumerate(self.lifts):
+            home, row = self._lift_row(k, lift)
+            lifts.setdefault(home, []).append(row)
+        objects = {i: [*self._objects(level), *lifts.get(i, [])] for i, level in self.levels.items()}
+        building = self._building()
+        out: dict[PartKey, Part] = {}
+        site = {
+            **{k: v for k, v in self.top.items() if k not in ("levels", "lifts", "model_instances", "navigation")},
+            "navigation": {
+                **{k: v for k, v in mapping(self.top.get("navigation"), "navigation").items() if k != "guided"},
+                "guided": {k: v for k, v in self.guided.items() if k not in ("lanes", "locations")},
+            },
+        }
+        if self.placed:
+            site["models"] = sorted(int(i) for listed in self.placed.values() for i, _ in listed)
+        if self.dangling:
+            site["dangling"] = self.dangling
+        digest = _rmf_site.digest(site)
+        for i, level in self.levels.items():
+            document = {BUILDING: building[i], NAME: {"of": digest, **self._document(level)}}
+            if not level.order:
+                document[NAME]["site"] = site
+            out[PartKey("topology", level.name, NETWORK)] = networks[i].with_document(document)
+            out[PartKey("objects", level.name, BUILDING)] = features(objects[i], "local", document)
+        if not taken:  # nothing of the network is there: a map of this family alone, and of no other
+            for level in self.levels.values():
+                network = out.pop(PartKey("topology", level.name, NETWORK))
+                out[PartKey("topology", level.name, BUILDING)] = network
+        self._warn_unknown()
+        return out
+
+    def _warn_unknown(self) -> None:
+        for member, count in sorted(self.strange.items()):
+            times = f" ({count} times)" if count > 1 else ""
+            self.context.warn(f"unknown member {member!r}{times}: it is kept for the way back and not understood")
+
+    def _document(self, level: _Level) -> dict[str, Any]:
+        """What of a level is no item, and what its items do not say."""
+        rest = {key: value for key, value in level.said.items() if key not in _LISTS}
+        rest["id"] = level.id
+        drawings: dict[str, Any] = {}
+        for i, said in elements(level.said.get("drawings"), f"{level.where}.drawings"):
+            where = f"{level.where}.drawings.{i}"
+            drawings[i] = {k: v for k, v in said.items() if k not in ("anchors", "fiducials", "measurements")}
+            drawings[i]["transform"] = self._transform(said, where)
+            used: set[str] = set()
+            for key, one in elements(said.get("measurements"), f"{where}.measurements"):
+                used.update(references(one.get("anchors"), f"{where}.measurements.{key}.anchors", 2))
+            used |= {str(one.get("anchor")) for _, one in elements(said.get("fiducials"), f"{where}.fiducials")}
+            drawings[i]["anchors"] = {a: raw for a, raw in mapping(said.get("anchors"), where).items() if a not in used}
+        forms = {
+            anchor: raw
+            for anchor, raw in mapping(level.said.get("anchors"), f"{level.where}.anchors").items()
+            if anchor not in level.nodes and "Translate2D" not in raw
+        }
+        return {"level": rest, "drawings": drawings, "forms": forms, "order": level.order}
+
+    # the network
+
+    def _networks(self, taken: set[str]) -> dict[str, Features]:
+        locations = self._locations()
+        self._name_nodes(locations, taken)
+        rows: dict[str, list[tuple[str, Any, Properties]]] = {i: [] for i in self.levels}
+        docks = self._edges(rows, taken)
+        robots = self._robots_at()
+        out = {}
+        for i, level in self.levels.items():
+            ids, properties = list(level.nodes.values()), []
+            for k, anchor in enumerate(level.nodes):
+                p = self._node(level, anchor, k, locations.get(anchor, []), docks.get((i, anchor)))
+                if (robot := robots.get((i, anchor))) is not None:
+                    said = p[BUILDING].setdefault("parameters", {})
+                    said[_rmf.ROBOT], said[_rmf.ROBOT_TYPE] = [1, robot["name"]], [1, robot.pop("model_name")]
+                    p[NAME]["robot"] = robot
+                properties.append(p)
+            xyz = np.array([self._node_place(level, a) for a in level.nodes], np.float64).reshape(-1, 3)
+            geometry = points(xyz[:, :2])
+            if (high := xyz[:, 2] != 0).any():
+                geometry[high] = points(xyz[high] + np.array([0.0, 0.0, level.elevation]))
+            nodes = list(zip(ids, geometry, properties, strict=True))
+            out[i] = features([*nodes, *rows[i]], "local")
+        return out
+
+    def _node_place(self, level: _Level, anchor: str) -> list[float]:
+        """[x, y, height above the level] of a node."""
+        if anchor in level.anchors:
+            return level.anchors[anchor]
+        lift = self.cabins[anchor]
+        raw = lift.said["cabin_anchors"][anchor]
+        return [*lift.cabin.outward(place(raw, "General", f"lifts.{lift.id}.cabin_anchors.{anchor}")), 0.0]
+
+    def _locations(self) -> dict[str, list[tuple[str, dict[str, Any]]]]:
+        """The locations by anchor."""
+        out: dict[str, list[tuple[str, dict[str, Any]]]] = {}
+        for i, said in self.locations:
+            self._look(said, "locations")
+            anchor = reference(said.get("anchor"), f"navigation.guided.locations.{i}.anchor")
+            out.setdefault(anchor, []).append((i, said))
+        return out
+
+    def _name_nodes(self, locations: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]], taken: set[str]) -> None:
+        """Which anchors of which levels are nodes, and their ids."""
+        owners = {anchor: level for level in self.levels.values() for anchor in level.anchors}
+        moved: set[str] = set(locations)
+        for i, said in self.lanes:
+            self._look(said, "lanes")
+            ends = references(said.get("anchors"), f"navigation.guided.lanes.{i}.anchors", 2)
+            moved.update(ends)
+            for here, other in (ends, ends[::-1]):
+                if here in self.cabins and other in owners:
+                    owners[other].cabins.add(here)
+        inside = {anchor for level in self.levels.values() for anchor in level.cabins}
+        for anchor in locations.keys() & self.cabins.keys() - inside:
+            served = self.cabins[anchor].visits
+            self.levels[served[0] if served else next(iter(self.levels))].cabins.add(anchor)
+        for level in self.levels.values():
+            fixed = {a for kind in ("walls", "doors", "floors") for _, s in self._items(level, kind) for a in s[0]}
+            names = [a for a in level.anchors if a in moved or a not in fixed]
+            names += sorted(level.cabins, key=int)
+            wanted = []
+            for anchor in names:
+                known = text(locations[anchor][0][1].get("name"), "locations") if anchor in locations else ""
+                known = "" if known == UNNAMED else known
+                wanted.append(_rmf.short(known) or f"{_rmf.short(level.name, 200)}/{anchor}")
+            ids = unique_ids(wanted, taken)
+            taken.update(ids)
+            level.nodes = dict(zip(names, ids, strict=True))
+            for anchor in names:
+                self.homes.setdefault(anchor, []).append(level)
+        lost = {i: said for anchor, listed in locations.items() if anchor not in self.homes for i, said in listed}
+        if lost:
+            self._keep("locations", lost)
+
+    def _keep(self, section: str, items: dict[str, Any]) -> None:
+        self.dangling.setdefault(section, {}).update(items)
+        problem = f"{len(items)} stand on no anchor of a level or a lift's cabin: they are kept for the way back only"
+        self.context.warn(problem, where=f"navigation.guided.{section}")
+
+    def _node(
+        self,
+        level: _Level,
+        anchor: str,
+        k: int,
+        locations: Sequence[tuple[str, Mapping[str, Any]]],
+        dock: str | None,
+    ) -> dict[str, Any]:
+        p: dict[str, Any] = {"kind": "node"}
+        rest: dict[str, Any] = {"anchor": int(anchor)}
+        parameters: dict[str, Any] = {}
+        source: Any = level.said.get("anchors")
+        if anchor in level.cabins:
+            lift = self.cabins[anchor]
+            parameters["lift_cabin"] = [1, lift.name]
+            source = lift.said["cabin_anchors"]
+            rest["lift"] = lift.name
+        if "Translate2D" not in (raw := source[anchor]):
+            rest["says"] = raw
+        for i, said in locations:
+            where = f"navigation.guided.locations.{i}"
+            name = text(said.get("name"), f"{where}.name")
+            if name and name != UNNAMED:
+                p.setdefault("name", name)
+            for m, tag in enumerate(said.get("tags") or []):
+                word, _ = variant(tag, f"{where}.tags[{m}]")
+                if word in _TAGS:
+                    parameters[_TAGS[word]] = [4, True]
+            if (mutex := self._mutex(said, where)) is not None:
+                parameters["mutex"] = [1, mutex]
+        if dock is not None:
+            parameters["dock_name"] = [1, dock]
+        if locations:
+            rest["locations"] = {i: {k: v for k, v in said.items() if k != "anchor"} for i, said in locations}
+        p[BUILDING] = {"index": k, **({"parameters": parameters} if parameters else {})}
+        p[NAME] = rest
+        return p
+
+    def _mutex(self, said: Mapping[str, Any], where: str) -> str | None:
+        group = said.get("mutex")
+        return None if group is None else self.mutexes.get(reference(group, f"{where}.mutex"))
+
+    def _edges(self, rows: dict[str, list[tuple[str, Any, Properties]]], taken: set[str]) -> dict[tuple[str, str], str]:
+        """The lanes as edges in the rows of their levels; gives the docks by level and anchor."""
+        docks: dict[tuple[str, str], str] = {}
+        lost: dict[str, Any] = {}
+        counts: Counter[str] = Counter()
+        made: list[tuple[str, str, Any, Properties]] = []
+        several = 0
+        for i, said in self.lanes:
+            where = f"navigation.guided.lanes.{i}"
+            ends = references(said.get("anchors"), f"{where}.anchors", 2)
+            found = self._level_of(ends)
+            if found is None:
+                lost[i] = said
+                continue
+            level, target = found
+            xyz = np.array([self._node_place(home, end) for home, end in zip(found, ends, strict=True)])
+            if target is not level or xyz[:, 2].any():
+                xyz[:, 2] += [home.elevation for home in found]
+            line = xyz if target is not level or xyz[:, 2].any() else xyz[:, :2]
+            graph, graphs = _rmf_site.graphs_of(said.get("graphs"), self.graphs, f"{where}.graphs")
+            several += graphs > 1
+            for both, motion, backward in self._motions(said, where):
+                mirrored = both and backward
+                a, b = (1, 0) if backward else (0, 1)
+                source, end = found[a].nodes[ends[a]], found[b].nodes[ends[b]]
+                counts[level.id] += not mirrored
+                orientation, limit = motion_words(motion, where)
+                mutex = self._mutex(said, where)
+                parameters: dict[str, Any] = {
+                    "bidirectional": [4, both],
+                    "graph_idx": [2, graph],
+                    "orientation": [1, _rmf.turned(orientation) if mirrored else orientation],
+                    **({} if mutex is None else {"mutex": [1, mutex]}),
+                    **({"speed_limit": [3, limit]} if limit else {}),
+                }
+                if motion.get("dock") is not None:
+                    dock = mapping(motion["dock"], f"{where}.dock")
+                    docks[found[b].id, ends[b]] = text(dock.get("name"), f"{where}.dock.name")
+                rest = {"index": counts[level.id] - 1, "parameters": parameters}
+                if mirrored:
+                    rest["reverse"] = True
+                p: dict[str, Any] = {"kind": "edge", **({"speed_limit": limit} if limit else {})}
+                p |= {"source": source, "target": end, BUILDING: rest}
+                p[NAME] = {"lane": int(i), "says": {k: v for k, v in said.items() if k != "anchors"}}
+                if backward:
+                    p[NAME]["reverse"] = True
+                made.append((level.id, _rmf.short(f"{source}_{end}", 490), segments(line[[a]], line[[b]])[0], p))
+        names = unique_ids((wanted for _, wanted, _, _ in made), taken)
+        taken.update(names)
+        for name, (home, _, geometry, edge) in zip(names, made, strict=True):
+            rows[home].append((name, geometry, edge))
+        if lost:
+            self._keep("lanes", lost)
+        if several:
+            problem = f"{several} lanes are of several graphs; a building and navigation graphs have them in the first"
+            self.context.warn(problem, where="navigation.guided.lanes")
+        return docks
+
+    def _motions(self, said: Mapping[str, Any], where: str) -> Iterable[tuple[bool, Mapping[str, Any], bool]]:
+        """(whether a building's two-way lane says it, motion, backward) of a lane's one or two directions."""
+        forward = mapping(said.get("forward"), f"{where}.forward")
+        name, content = variant(said.get("reverse", "Same"), f"{where}.reverse")
+        if name not in ("Same", "Disable", "Different"):
+            refuse(f"must be Same, Disable or Different, is {name[:40]!r}", f"{where}.reverse")
+        back = forward if name == "Same" else mapping(content, f"{where}.reverse")
+        there, here = (motion_words(motion, where) for motion in (forward, back))
+        both = name != "Disable" and here == (_rmf.turned(there[0]), there[1])
+        yield both, forward, False
+        if name != "Disable":
+            yield both, back, True
+
+    def _level_of(self, ends: Sequence[str]) -> tuple[_Level, _Level] | None:
+        """The levels of a lane's start and end."""
+        first, second = (self.homes.get(end, []) for end in ends)
+        both = next((level for level in first if ends[1] in level.nodes), None)
+        if both is not None:
+            return both, both
+        return (first[0], second[0]) if first and second else None
+
+    # objects
+
+    def _items(self, level: _Level, section: str) -> list[tuple[str, tuple[list[str], dict[str, Any]]]]:
+        """(id, (anchors, what else it says)) of walls, doors and floors."""
+        out = []
+        for i, said in elements(level.said.get(section), f"{level.where}.{section}"):
+            where = f"{level.where}.{section}.{i}.anchors"
+            out.append((i, (references(said.get("anchors"), where, None if section == "floors" else 2), said)))
+        return out
+
+    def _raw_anchor(self, level: _Level, anchor: str) -> Any:
+        for home in (level.said.get("anchors"), self.top.get("anchors")):
+            if isinstance(home, dict) and anchor in home:
+                return home[anchor]
+        return None
+
+    def _objects(self, level: _Level) -> list[tuple[str, Any, Properties]]:
+        rows: list[tuple[str, Any, Properties]] = []
+        for section, kind, category in (
+            ("walls", "wall", "Wall"),
+            ("doors", "door", "Door"),
+            ("floors", "floor", "Floor"),
+        ):
+            for k, (i, (anchors, said)) in enumerate(self._items(level, section)):
+                self._look(said, section)
+                raws = [self._raw_anchor(level, a) for a in anchors]
+                if any(raw is None for raw in raws):
+                    refuse("stands on anchors that neither its level nor the site has", f"{level.where}.{section}.{i}")
+                at = np.array([place(raw, category, "anchors")[:2] for raw in raws]).reshape(-1, 2)
+                where = f"{level.where}.{section}.{i}"
+                p = self._solid(kind, k, said, where)
+                rest = {key: value for key, value in said.items() if key not in ("anchors", "name")}
+                p[NAME] = {"id": int(i), "anchors": [int(a) for a in anchors], "says": rest}
+                rows.append((self._id(level, kind, i), shapely.LineString(at) if kind != "floor" else _ring(at), p))
+        return [*rows, *self._drawn(level), *self._models(level)]
+
+    def _id(self, level: _Level, kind: str, i: str) -> str:
+        return f"{_rmf.short(level.name, 200)}/{kind}/{i}"
+
+    def _solid(self, kind: str, k: int, said: Mapping[str, Any], where: str) -> dict[str, Any]:
+        p: dict[str, Any] = {"kind": kind}
+        parameters: dict[str, Any] = {}
+        if kind == "door":
+            name = text(said.get("name"), f"{where}.name")
+            if name:
+                p["name"] = name
+            parameters = _rmf_site.door_parameters(said.get("kind"), f"{where}.kind")
+            parameters["name"] = [1, name]
+        elif said.get("texture") is not None:
+            group = self.textures.get(reference(said["texture"], f"{where}.texture"))
+            parameters = _rmf_site.texture_parameters(group, kind) if group is not None else {}
+        if kind != "floor":
+            for word, member in (("height", "top"), ("base", "bottom")):
+                found = _rmf_site.height(said.get(member), f"{where}.{member}")
+                if found is not None and found > 0:
+                    p[word] = found
+        p[BUILDING] = {"index": k, "parameters": parameters}
+        return p
+
+    def drawings(self) -> Iterable[tuple[str, str]]:
+        """(place, file) of the images that are named on this machine."""
+        for level in self.levels.values():
+            for i, said in elements(level.said.get("drawings"), f"{level.where}.drawings"):
+                where = f"{level.where}.drawings.{i}.properties.source"
+                kind, name = _rmf_site.asset(mapping(said.get("properties"), where).get("source"), where)
+                if name and kind in ("Local", "Remote"):
+                    yield where, name
+
+    def _primary(self, level: _Level) -> str | None:
+        """The drawing that a building would have."""
+        listed = dict(elements(level.said.get("drawings"), f"{level.where}.drawings"))
+        rankings = mapping(level.said.get("rankings"), f"{level.where}.rankings").get("drawings") or []
+        ranked = references(rankings, f"{level.where}.rankings.drawings")
+        return next((i for i in ranked if i in listed), next(iter(listed), None))
+
+    def _transform(self, said: Mapping[str, Any], where: str) -> list[float]:
+        """[scale, rotation, x, y] from a drawing's pixels (y up) to metres.
+
+        Measurements that say the same scale in double precision say it better than pixels_per_meter.
+        """
+        p = mapping(said.get("properties"), f"{where}.properties")
+        pixels = number(p.get("pixels_per_meter", 100.0), f"{where}.properties.pixels_per_meter")
+        if not 1e-6 <= pixels <= 1e9:
+            refuse("must be between 1e-6 and 1e9", f"{where}.properties.pixels_per_meter")
+        x, y, _, _, _, yaw = _rmf_site.pose(p.get("pose"), f"{where}.properties.pose")
+        anchors = self._anchors(said.get("anchors"), f"{where}.anchors")
+        scales = []
+        for k, m in elements(said.get("measurements"), f"{where}.measurements"):
+            a, b = references(m.get("anchors"), f"{where}.measurements.{k}.anchors", 2)
+            if m.get("distance") is not None and a in anchors and b in anchors:
+                length = math.dist(anchors[a][:2], anchors[b][:2])
+                scales.append(number(m["distance"], f"{where}.measurements.{k}.distance") / length if length else 0.0)
+        mean = sum(scales) / len(scales) if scales else 0.0
+        scale = mean if abs(mean * pixels - 1.0) < _rmf_site.SINGLE else 1.0 / pixels
+        return [scale, yaw, x, y]
+
+    def _drawn(self, level: _Level) -> list[tuple[str, Any, Properties]]:
+        """The measurements and fiducials of a level's drawings, in metres."""
+        rows: list[tuple[str, Any, Properties]] = []
+        counts: Counter[str] = Counter()
+        for i, said in elements(level.said.get("drawings"), f"{level.where}.drawings"):
+            where = f"{level.where}.drawings.{i}"
+            self._look(said, "drawings")
+            transform = self._transform(said, where)
+            anchors = self._anchors(said.get("anchors"), f"{where}.anchors")
+            at = {key: moved(transform, place_) for key, place_ in anchors.items()}
+
+            def places(ids: Sequence[str], what: str, at: Mapping[str, Array] = at) -> list[Array]:
+                if any(a not in at for a in ids):
+                    refuse("stands on anchors that its drawing does not have", what)
+                return [at[a] for a in ids]
+
+            for section, kind in (("measurements", "measurement"), ("fiducials", "fiducial")):
+                for key, one in elements(said.get(section), f"{where}.{section}"):
+                    self._look(one, section)
+                    here = f"{where}.{section}.{key}"
+                    p: dict[str, Any] = {"kind": kind, BUILDING: {"index": counts[kind]}}
+                    counts[kind] += 1
+                    if kind == "measurement":
+                        ids = references(one.get("anchors"), f"{here}.anchors", 2)
+                        geometry = shapely.LineString(places(ids, here))
+                        distance = one.get("distance")
+                        known = {} if distance is None else {"distance": [3, number(distance, f"{here}.distance")]}
+                        p[BUILDING]["parameters"] = known
+                    else:
+                        ids = [reference(one.get("anchor"), f"{here}.anchor")]
+                        geometry = shapely.Point(places(ids, here)[0])
+                        if one.get("affiliation") is not None:
+                            group = self.groups.get(reference(one["affiliation"], f"{here}.affiliation"), {})
+                            p["name"] = text(group.get("name"), "fiducial_groups")
+                    rest = {k: v for k, v in one.items() if k not in ("anchor", "anchors")}
+                    p[NAME] = {"id": int(key), "drawing": int(i), "anchors": [int(a) for a in ids], "says": rest}
+                    rows.append((self._id(level, kind, key), geometry, p))
+        return rows
+
+    # models and robots
+
+    def _instances(self, level: _Level) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
+        """(id, instance, description) of the level's models; older releases say both at once, below the level."""
+        out = []
+        for i, said in self.placed.get(level.id, []):
+            key = said.get("description")
+            known = None if key is None else reference(key, f"model_instances.{i}.description")
+            out.append((i, said, self.descriptions.get(known or "", {})))
+        older = elements(level.said.get("models"), f"{level.where}.models")
+        return out + [(i, said, said) for i, said in older]
+
+    def _placed(self) -> dict[str, list[tuple[str, dict[str, Any]]]]:
+        """The models by the level that they stand on."""
+        out: dict[str, list[tuple[str, dict[str, Any]]]] = {}
+        for i, said in elements(self.top.get("model_instances"), "model_instances"):
+            parent = reference(said.get("parent"), f"model_instances.{i}.parent")
+            if parent not in self.levels:
+                self.dangling.setdefault("model_instances", {})[i] = said
+            out.setdefault(parent, []).append((i, said))
+        return out
+
+    def _robots_at(self) -> dict[tuple[str, str], dict[str, Any]]:
+        """The robots that start at a location, by level and anchor."""
+        out: dict[tuple[str, str], dict[str, Any]] = {}
+        for level in self.levels.values():
+            listed = [a for a in level.nodes if a in level.anchors]
+            if not self.robots or not listed:
+                continue
+            tree = shapely.STRtree(points(np.array([level.anchors[a][:2] for a in listed])))
+            for i, said, description in self._instances(level):
+                if str(said.get("description")) not in self.robots:
+                    continue
+                now = _rmf_site.pose(said.get("pose"), f"model_instances.{i}.pose")
+                near = tree.query_nearest(shapely.Point(now[:2]), max_distance=SAME_PLACE, all_matches=False)
+                anchor = listed[int(near[0])] if len(near) else None
+                name = text(said.get("name"), f"model_instances.{i}.name")
+                if anchor is None or (level.id, anchor) in out or not name:
+                    continue
+                rest = {k: v for k, v in said.items() if k not in ("parent", "name")}
+                model = _model_name(description, f"model_instances.{i}")
+                out[level.id, anchor] = {"id": int(i), "name": name, "says": rest, "model_name": model}
+        self.placed_robots = {robot["id"] for robot in out.values()}
+        return out
+
+    def _models(self, level: _Level) -> list[tuple[str, Any, Properties]]:
+        rows: list[tuple[str, Any, Properties]] = []
+        for i, said, description in self._instances(level):
+            if int(i) in self.placed_robots:
+                continue
+            where = f"model_instances.{i}"
+            self._look(said, "model_instances")
+            x, y, z, *turn = _rmf_site.pose(said.get("pose"), f"{where}.pose")
+            name = text(said.get("name"), f"{where}.name")
+            p: dict[str, Any] = {
+                "kind": "robot" if str(said.get("description")) in self.robots else "model",
+                **({"name": name} if name else {}),
+                "pose": [x, y, z + level.elevation, *turn],
+                BUILDING: {
+                    "index": len(rows),
+                    "says": {
+                        "model_name": _model_name(description, where),
+                        "static": description.get("is_static") is True,
+                    },
+                },
+                NAME: {"id": int(i), "says": {k: v for k, v in said.items() if k not in ("parent", "name")}},
+            }
+            rows.append((self._id(level, "model", i), shapely.Point(x, y), p))
+        return rows
+
+    # lifts
+
+    def _lift_row(self, k: int, lift: _Lift) -> tuple[str, tuple[str, Any, Properties]]:
+        """(level, row) of a lift; it stands on its initial level, else on the lowest that it visits."""
+        properties = mapping(lift.said.get("properties"), f"lifts.{lift.id}.properties")
+        where = f"lifts.{lift.id}"
+        rect = _rmf_site.rectangle(properties, where)
+        initial = properties.get("initial_level")
+        home = None if initial is None else reference(initial, f"{where}.properties.initial_level")
+        floors = sorted(lift.visits or self.levels, key=lambda i: self.levels[i].elevation)
+        level = self.levels[home if home in self.levels else floors[0]]
+        doors: dict[str, Any] = {}
+        served: dict[str, list[str]] = {self.levels[i].name: [] for i in lift.visits}
+        said_doors = dict(elements(lift.said.get("cabin_doors"), f"{where}.cabin_doors"))
+        for face in _rmf_site.FACES:
+            door = _rmf_site.cabin_door(rect, face, f"{where}.properties.cabin.{face}")
+            if door is None:
+                continue
+            doors[face] = door
+            key = reference(rect[face].get("door"), f"{where}.properties.cabin.{face}.door")
+            for visit in references(said_doors.get(key, {}).get("visits", []), f"{where}.cabin_doors.{key}.visits"):
+                if visit in self.levels:
+                    served[self.levels[visit].name].append(face)
+        says = {
+            "doors": doors,
+            "level_doors": served,
+            "reference_floor_name": level.name,
+            "initial_floor_name": level.name if home is not None else "",
+            "lowest_floor": self.levels[floors[0]].name,
+            "highest_floor": self.levels[floors[-1]].name,
+            "plugins": properties.get("is_static") is not True,
+        }
+        cabin = lift.cabin
+        rest = {
+            **lift.said,
+            "cabin_anchors": {
+                a: raw for a, raw in mapping(lift.said.get("cabin_anchors"), where).items() if a not in self.homes
+            },
+        }
+        p = {
+            "kind": "lift",
+            "name": lift.name,
+            "size": _rmf_site.cabin_size(cabin),
+            "pose": [cabin.x, cabin.y, level.elevation, 0.0, 0.0, cabin.yaw],
+            BUILDING: {"index": k, "says": says},
+            NAME: {"id": int(lift.id), "says": rest, "was": [*cabin.pose, cabin.depth, cabin.width]},
+        }
+        return level.id, (self._id(level, "lift", lift.id), shapely.Point(cabin.x, cabin.y), p)
+
+    # as a building
+
+    def _building(self) -> dict[str, dict[str, Any]]:
+        """What a building's documents would say: pixels where each level has a drawing, else metres."""
+        name = text(mapping(self.top.get("properties"), "properties").get("name"), "properties.name")
+        found: dict[str, tuple[list[float], str]] = {}
+        for i, level in self.levels.items():
+            primary = self._primary(level)
+            if primary is None:
+                continue
+            said = mapping(level.said["drawings"], "drawings")[primary]
+            where = f"{level.where}.drawings.{primary}"
+            _, file = _rmf_site.asset(mapping(said.get("properties"), where).get("source"), where)
+            found[i] = self._transform(said, where), file
+        drawn = len(found) == len(self.levels)
+        system = "reference_image" if drawn else "cartesian_meters"
+        building: dict[str, Any] = {"name": name, "coordinate_system": system}
+        straight = [i for i, (turn, _) in found.items() if turn[1:] == [0.0, 0.0, 0.0]]
+        if drawn and straight:
+            building["reference_level_name"] = self.levels[straight[0]].name
+        out: dict[str, dict[str, Any]] = {}
+        for i, level in self.levels.items():
+            said = {"elevation": level.elevation}
+            out[i] = {"building": building, "level": said, "order": level.order}
+            if i in found:
+                out[i]["transform"], file = found[i]
+                said["drawing"] = {"filename": file}
+        return out
+
+
+def motion_words(motion: Mapping[str, Any], where: str) -> tuple[str, float]:
+    """(orientation in a building's words, speed limit or 0) of a motion along a lane."""
+    name, content = variant(motion.get("orientation_constraint") or "None", f"{where}.orientation_constraint")
+    if name in ("RelativeYaw", "AbsoluteYaw"):
+        _rmf_site.angle(content, f"{where}.orientation_constraint")
+    elif name not in _ORIENTATIONS and name != "None":
+        refuse(f"unknown orientation constraint {name[:40]!r}", where)
+    limit = motion.get("speed_limit")
+    return _ORIENTATIONS.get(name, ""), 0.0 if limit is None else max(0.0, number(limit, f"{where}.speed_limit"))
+
+
+def moved(transform: Sequence[float], at: Sequence[float]) -> Array:
+    """Metres of a drawing's pixel (y up)."""
+    scale, turn, x, y = transform
+    c, s = scale * math.cos(turn), scale * math.sin(turn)
+    return np.array([c * at[0] - s * at[1] + x, s * at[0] + c * at[1] + y])
+
+
+def _ring(at: Array) -> Any:
+    """A polygon; where there are too few corners for one, its points."""
+    if not len(at):
+        return None
+    closed = (at[0] == at[-1]).all()
+    return shapely.MultiPoint(at) if len(at) < (4 if closed else 3) else shapely.Polygon(at)
+
+
+def _model_name(description: Mapping[str, Any], where: str) -> str:
+    """The name that a building would find the model by."""
+    if "source" not in description:
+        return ""
+    kind, name = _rmf_site.asset(description["source"], f"{where}.source")
+    if kind == "Search":
+        return name
+    parts = [part for part in name.split("/") if part and "." not in part]
+    return parts[-1] if parts else name
+
+
+# --- the format ------------------------------------------------------------------------------------------------------
+
+_JSON_SITE = re.compile(rb'"format_version"\s*:\s*"')
+_RON_SITE = re.compile(rb'\bformat_version\s*:\s*"')
+_OF_SITE = re.compile(rb'[\s,{("](?:levels|navigation|geographic_offset|model_instances)"?\s*:')
+
+
+def detect(name: str, data: bytes) -> bool:
+    """JSON or RON with a format's version and what only a site has."""
+    low = name.lower()
+    if low.endswith(".json"):
+        return bool(_JSON_SITE.search(data) and _OF_SITE.search(data))
+    return low.endswith(".ron") and bool(_RON_SITE.search(data) and _OF_SITE.search(data))
+
+
+def by_file(name: str) -> dict[str, str]:
+    """``map.site.ron`` asks for RON."""
+    return {"encoding": "ron" if name.endswith(".ron") else "json"} if name.endswith((".ron", ".json")) else {}
+
+
+def choose(keys: Sequence[PartKey], options: Any) -> Sequence[PartKey]:  # noqa: ARG001 - one signature for all formats
+    """The networks, the objects that came from Open-RMF, and the drawings."""
+    return [
+        key
+        for key in keys
+        if key.layer == "topology"
+        or (key.layer == "objects" and key.name in (BUILDING, NAV_GRAPH))
+        or (key.layer == "resources" and key.name == BUILDING)
+    ]
+
+
+register(
+    Format(
+        name=NAME,
+        title="Site (Open-RMF site editor)",
+        files=(FILE, FILE_RON),
+        media_types=("application/json", "text/plain"),
+        carries=frozenset({"topology", "objects", "resources"}),
+        detect=detect,
+        read=read,
+        check=_rmf_site_rules.check,
+        write=write,
+        needs=Needs(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
+        companions=companions_of(re.compile(rb'\b(?:Local|Remote)"?\s*[:(]\s*"([^"\n]{1,500})"')),
+        family=BUILDING,
+        rank=45,
+        write_options=WriteOptions,
+        extensions=(".site.json", ".site.ron", ".json", ".ron"),
+        choose=choose,
+        by_file=by_file,
+    )
+)
