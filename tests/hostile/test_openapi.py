@@ -1,0 +1,86 @@
+"""Every call that OpenAPI describes, with values that its schemas allow and nobody thought of.
+
+``SCHEMATHESIS_EXAMPLES=500 pytest tests/hostile/test_openapi.py`` looks longer than CI does.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from app.cli import demo
+from app.cli.client import Client
+from tests.api.conftest import ADMIN, Api, running, settings_for
+
+EXAMPLES = int(os.environ.get("SCHEMATHESIS_EXAMPLES", "3"))
+CPU_SECONDS = 2.0
+FOLLOWED = "/api/v1/events"
+"""Server-sent events have no end, unless they are not followed."""
+
+
+@pytest.fixture(scope="module")
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Api]:
+    """A server with the demo and one more environment, which may be deleted."""
+    with running(settings_for(tmp_path_factory.mktemp("openapi"), job_seconds=60)) as api:
+        with Client(api.url, ADMIN) as client:
+            demo.install(client)
+        yield api
+
+
+def test_every_answer_is_declared_and_no_call_makes_the_server_fail(api: Api) -> None:
+    schema = schemathesis.openapi.from_dict(api.get("/openapi.json").json())
+    found: list[str] = []
+    count = 0
+
+    for result in schema.get_all_operations():
+        operation = result.ok()
+
+        @settings(
+            max_examples=EXAMPLES,
+            deadline=None,
+            derandomize="SCHEMATHESIS_EXAMPLES" not in os.environ,
+            database=None,
+            phases=[Phase.generate],
+            suppress_health_check=list(HealthCheck),
+        )
+        @given(case=operation.as_strategy(), known=st.booleans())
+        def call(case: Any, known: bool) -> None:
+            nonlocal count
+            names = {"env": demo.NAME, "v": "latest"} if known and case.method != "DELETE" else {}
+            case.path_parameters = {**(case.path_parameters or {}), **names}
+            arguments = case.as_transport_kwargs(base_url=api.url)
+            if case.operation.path == FOLLOWED:
+                arguments["params"] = {**(arguments.get("params") or {}), "follow": "false"}
+            headers = {n: v for n, v in (case.headers or {}).items() if n.lower() != "authorization"}
+            if isinstance(arguments.get("data"), (bytes, str)):
+                arguments["content"] = arguments.pop("data")
+            before = time.process_time()
+            try:
+                answer = api.http.request(**{k: v for k, v in arguments.items() if k in KEPT}, headers=headers)
+            except httpx.LocalProtocolError:
+                return  # no header that can be sent
+            spent = time.process_time() - before
+            count += 1
+            where = f"{case.method} {case.operation.path} {arguments}"[:2000]
+            if answer.status_code >= 500 and not (answer.status_code in (503, 507) and "retry-after" in answer.headers):
+                found.append(f"{answer.status_code} {answer.text[:300]}: {where}")
+            declared = case.operation.definition.raw["responses"]
+            if str(answer.status_code) not in declared:
+                found.append(f"{answer.status_code} is not declared: {answer.text[:300]}: {where}")
+            if spent > CPU_SECONDS:
+                found.append(f"{spent:.1f} s of CPU: {where}")
+
+        call()
+    assert count > 200
+    assert not found, f"{len(found)} of {count}:\n" + "\n".join(found[:20])
+
+
+KEPT = {"method", "url", "params", "json", "data", "files", "content"}
