@@ -54,6 +54,7 @@ from app.api import (
 )
 from app.api.access import Access
 from app.api.answers import API
+from app.api.connections import ConnectionLimits, Connections, fit_open_files
 from app.api.deltas import Deltas
 from app.api.guard import Guard
 from app.api.jobs import BEAT_SECONDS, Work
@@ -170,7 +171,7 @@ def from_environment() -> Server:
 
 
 def server_config(settings: Settings, app: Any = "app.main:from_environment", **more: Any) -> uvicorn.Config:
-    """uvicorn as this server needs it: fast loop and parser, bounded heads, no access log, no version in headers.
+    """uvicorn as this server needs it: fast loop and parser, bounded connections, no access log, no version in headers.
 
     app: an application, or the import string of a factory (needed for several workers, who read the settings from the
     environment: ``os.environ.update(settings.as_environment())`` first).
@@ -180,12 +181,19 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         os.environ["PROMETHEUS_MULTIPROC_DIR"] = str(folder.resolve())
+    limits = ConnectionLimits(
+        total=fit_open_files(settings.max_connections),
+        per_address=settings.max_connections_per_address,
+        head_seconds=settings.header_seconds,
+        stall_seconds=settings.body_seconds,
+        pace=settings.body_pace,
+    )
     options: dict[str, Any] = {
         "factory": isinstance(app, str),
         "host": settings.host,
         "port": settings.port,
         "workers": settings.workers,
-        "http": BoundedProtocol,
+        "http": partial(BoundedProtocol, Connections(limits)),
         "loop": "uvloop" if _has_uvloop() else "auto",
         "ws": "none",
         "lifespan": "on",
@@ -197,9 +205,7 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
     }
     if settings.tls_certificate is not None:
         options |= {"ssl_certfile": str(settings.tls_certificate), "ssl_keyfile": str(settings.tls_key)}
-    config = uvicorn.Config(app, **{**options, **more})
-    config.head_seconds = settings.header_seconds  # type: ignore[attr-defined]  # read by BoundedProtocol
-    return config
+    return uvicorn.Config(app, **{**options, **more})
 
 
 def _has_uvloop() -> bool:
@@ -273,6 +279,7 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
             spool_dir=settings.spool_dir,
             max_json_bytes=settings.max_json_bytes,
             body_seconds=settings.body_seconds,
+            body_pace=settings.body_pace,
             insecure_no_auth=settings.insecure_no_auth,
             data_dir=settings.data_dir,
             zenoh_mode=settings.zenoh_mode,

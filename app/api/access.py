@@ -198,14 +198,22 @@ def _token(header: bytes) -> str:
 
 
 def source_of(client: str | None) -> str:
-    """What counts as one source: an IPv4 address, the /64 of an IPv6 one."""
+    """What counts as one source: an IPv4 address (also one mapped into IPv6), the /64 of an IPv6 one."""
     try:
         address = ipaddress.ip_address(client or "")
     except ValueError:
         return client or ""
     if isinstance(address, ipaddress.IPv6Address):
-        return str(ipaddress.ip_network((int(address) >> 64 << 64, 64)))
+        if address.ipv4_mapped is not None:
+            return str(address.ipv4_mapped)
+        if not address.is_loopback:
+            return str(ipaddress.ip_network((int(address) >> 64 << 64, 64)))
     return str(address)
+
+
+def is_loopback(source: str) -> bool:
+    """Whether a source is this machine itself."""
+    return source == "::1" or (source.startswith("127.") and "/" not in source)
 
 
 @dataclass(frozen=True, slots=True)
