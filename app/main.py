@@ -60,7 +60,7 @@ from app.api.guard import Guard
 from app.api.jobs import BEAT_SECONDS, Work
 from app.api.maps import Hot, Server
 from app.api.metrics import Metrics
-from app.api.protocol import BoundedProtocol
+from app.api.protocol import BoundedProtocol, tls_context
 from app.api.services import ApiOptions, Services
 from app.api.signed import SignedLinks
 from app.api.uploads import Intake
@@ -188,12 +188,16 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
         stall_seconds=settings.body_seconds,
         pace=settings.body_pace,
     )
+    tls = None
+    if settings.tls_certificate is not None and settings.tls_key is not None:
+        tls = settings.tls_certificate, settings.tls_key
+        tls_context(*tls)  # a file that cannot be used is reported at the start
     options: dict[str, Any] = {
         "factory": isinstance(app, str),
         "host": settings.host,
         "port": settings.port,
         "workers": settings.workers,
-        "http": partial(BoundedProtocol, Connections(limits)),
+        "http": partial(BoundedProtocol, Connections(limits), tls),
         "loop": "uvloop" if _has_uvloop() else "auto",
         "ws": "none",
         "lifespan": "on",
@@ -203,8 +207,6 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
         "timeout_keep_alive": 30,
         "timeout_graceful_shutdown": 20,
     }
-    if settings.tls_certificate is not None:
-        options |= {"ssl_certfile": str(settings.tls_certificate), "ssl_keyfile": str(settings.tls_key)}
     return uvicorn.Config(app, **{**options, **more})
 
 

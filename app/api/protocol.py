@@ -7,11 +7,16 @@ closed where its request is answered before the body has come completely.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import ssl
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import orjson
 from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.protocols.utils import get_remote_addr
 
 from app.api.connections import Connections
 from app.api.problems import MEDIA_TYPE, RETRY_SECONDS, document
@@ -30,12 +35,35 @@ PROVE = "prove"
 """In the ``state`` of a request's scope: what to call once the request has shown a valid token or link."""
 
 
+def _feed(protocol: Any, data: bytearray) -> None:
+    """Hand bytes to a protocol that reads into buffers of its own, as those of TLS do."""
+    while data:
+        buffer = protocol.get_buffer(len(data))
+        size = min(len(buffer), len(data))
+        buffer[:size] = data[:size]
+        protocol.buffer_updated(size)
+        del data[:size]
+
+
+@cache
+def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
+    """Create what HTTPS is served with (TLS 1.2 and newer) from PEM files; OSError where they cannot be used."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    return context
+
+
 class BoundedProtocol(HttpToolsProtocol):
     """A connection that cannot take up more of the server than its share."""
 
-    def __init__(self, connections: Connections, /, config: Config, *args: Any, **kwargs: Any) -> None:
+    def __init__(
+        self, connections: Connections, tls: tuple[Path, Path] | None, /, config: Config, *args: Any, **kwargs: Any
+    ) -> None:
         super().__init__(config, *args, **kwargs)
         self._connections = connections
+        self._tls = tls
+        self._handshake: asyncio.Task[None] | None = None
+        self._held: bytearray | None = None
         self._limits = connections.limits
         self._head_timer: asyncio.TimerHandle | None = None
         self._stall_timer: asyncio.TimerHandle | None = None
@@ -67,12 +95,52 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """A connection opens: there must be a place for it, and its first request must come soon."""
+        peer = get_remote_addr(transport)
+        accepted = self._connections.open(self, peer[0] if peer else None)
+        if self._tls is None:
+            self._begin(transport)
+            if not accepted:
+                self._refuse(503, "too many connections are open: try again in a few seconds")
+            return
+        self.transport = transport
+        if not accepted:
+            transport.abort()  # nothing can be said before the handshake
+            return
+        self._held = bytearray()
+        self._handshake = self.loop.create_task(self._begin_tls(transport, self._tls))
+
+    async def _begin_tls(self, transport: asyncio.Transport, tls: tuple[Path, Path]) -> None:
+        """Agree on TLS. The event loop's own way to do so counts no connection before its handshake is over."""
+        secured = None
+        handshake = asyncio.ensure_future(
+            self.loop.start_tls(
+                transport,
+                self,
+                tls_context(*tls),
+                server_side=True,
+                ssl_handshake_timeout=self._limits.head_seconds,
+                ssl_shutdown_timeout=LINGER_SECONDS,
+            )
+        )
+        await asyncio.sleep(0)  # from here on TLS reads; what came before is handed to it
+        hello, self._held = self._held, bytearray()
+        if hello:
+            self.loop.call_soon(_feed, transport.get_protocol(), hello)
+        with contextlib.suppress(OSError):
+            secured = await handshake
+        if secured is None or secured.is_closing():
+            self._connections.close(self)
+            transport.abort()
+            return
+        self._begin(secured)
+        early, self._held = self._held, None
+        if early:
+            self.data_received(bytes(early))
+
+    def _begin(self, transport: asyncio.Transport) -> None:
         super().connection_made(transport)
         self._closing = _Closing(self)
-        if self._connections.open(self, self.client[0] if self.client else None):
-            self._await_head()
-        else:
-            self._refuse(503, "too many connections are open: try again in a few seconds")
+        self._await_head()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """It is over."""
@@ -140,6 +208,11 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Bytes came in."""
+        if self._held is not None:  # TLS has not begun to read, or its handshake is just over
+            if self.transport.get_protocol() is self:
+                self.transport.pause_reading()
+            self._held += data
+            return
         if self.lingers:
             self._left -= len(data)
             if self._left < 0:
@@ -160,6 +233,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def linger(self) -> None:
         """Close, but first let the client read the answer: bytes that nobody takes in would reset the connection."""
+        self._head_came()
         self._linger_timer = self.loop.call_later(LINGER_SECONDS, self.transport.abort)
         self.flow.resume_reading()
         if self.transport.can_write_eof():

@@ -6,6 +6,7 @@ import contextlib
 import resource
 import select
 import socket
+import ssl
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ import pytest
 
 from app.api.connections import TRUST_SECONDS, ConnectionLimits, Connections, fit_open_files
 from tests.api.conftest import ADMIN, Api, running, settings_for
+from tests.certificates import Authority
 from tests.cli.conftest import ServerProcess
 
 HEADERS = {"Authorization": f"Bearer {ADMIN}"}
@@ -262,6 +264,25 @@ def _send_for(line: socket.socket, seconds: float) -> None:
     while time.monotonic() < deadline:
         line.send(b"G")
         time.sleep(0.05)
+
+
+def test_unfinished_handshakes_are_bounded(tmp_path: Path) -> None:
+    authority = Authority(tmp_path)
+    certificate, key = authority.sign("server")
+    settings = settings_for(
+        tmp_path / "data", tls_certificate=certificate, tls_key=key, max_connections=16, header_seconds=1.0
+    )
+    trust = ssl.create_default_context(cafile=str(authority.pem))
+    with running(settings, trust) as api, contextlib.ExitStack() as silent:
+        lines = [silent.enter_context(connect(api.url)) for _ in range(40)]
+        for line in lines[:24]:
+            read_to_end(line)
+        api.get("formats")
+        for line in lines[24:]:
+            read_to_end(line)
+        with trust.wrap_socket(connect(api.url), server_hostname="127.0.0.1") as line:
+            line.sendall(f"POST /api/v1/environments HTTP/1.1\r\nHost: x\r\n{JSON_HEAD}\r\n".encode())
+            assert read_to_end(line)[0].startswith(b"HTTP/1.1 401 ")
 
 
 def test_server_answers_during_a_flood_of_slow_connections(tmp_path: Path) -> None:
