@@ -125,7 +125,11 @@ class Settings(BaseSettings):
         "`FLEETMAP_MAX_CONNECTIONS`.",
     )
     token_failures: int = Field(
-        default=20, ge=1, le=10_000, description="Wrong tokens a minute from one address before it is answered 429."
+        default=20,
+        ge=1,
+        le=10_000,
+        description="Wrong tokens a minute from one address before further wrong ones get 429; a valid token is always "
+        "accepted.",
     )
 
     zenoh_mode: Literal["router", "client", "off"] = Field(

@@ -88,6 +88,9 @@ log = logging.getLogger(__name__)
 TICK_SECONDS = 1.0
 """How late a planned move of a channel may come."""
 
+CLOCK_TOLERANCE = timedelta(seconds=60)
+"""How far the clock may go back without a word in the log."""
+
 COLLECT_EVERY = timedelta(hours=24)
 COLLECT_GRACE = timedelta(hours=6)
 """Data that nothing refers to is removed once a day, unless it is younger than this (an upload may be using it)."""
@@ -431,15 +434,29 @@ def _first_token(store: Store, settings: Settings) -> None:
         print(f"administrator's token, shown only this once: {text}", file=sys.stdout, flush=True)
 
 
+def _note_time(newest: datetime) -> datetime:
+    """The present; a clock that was set back is reported."""
+    now = datetime.now(UTC)
+    if newest - now > CLOCK_TOLERANCE:
+        log.warning(
+            "clock: set back by %d s; expired tokens and links stay expired: replace those that expired too early",
+            (newest - now).total_seconds(),
+        )
+    return now
+
+
 async def _tick(here: Services) -> None:
-    """Planned moves and roll-outs of channels, ends of overlays, signs of life of jobs, and the daily clean-up."""
+    """Ends of tokens and overlays, planned moves and roll-outs, signs of life of jobs, and the daily clean-up."""
     beat = 0.0
-    collect = datetime.now(UTC) + COLLECT_EVERY
+    newest = datetime.now(UTC)
+    collect = newest + COLLECT_EVERY
     while True:
         await asyncio.sleep(TICK_SECONDS)
         beat += TICK_SECONDS
         try:
             here.hot.count()
+            newest = _note_time(newest)
+            await run_in_threadpool(here.store.end_expired_tokens)
             await run_in_threadpool(here.store.apply_due, datetime.now(UTC))
             await run_in_threadpool(here.store.advance_rollouts, datetime.now(UTC), decide)
             await run_in_threadpool(here.store.end_due_overlays, datetime.now(UTC))

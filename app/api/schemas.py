@@ -924,6 +924,7 @@ class TokenOut(BaseModel):
     robot: str | None
     expires: datetime | None
     created: datetime
+    ended: datetime | None = Field(description="When it was seen to have expired; it stays expired.")
 
 
 class NewTokenOut(TokenOut):
