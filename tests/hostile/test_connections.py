@@ -270,7 +270,7 @@ def test_unfinished_handshakes_are_bounded(tmp_path: Path) -> None:
     authority = Authority(tmp_path)
     certificate, key = authority.sign("server")
     settings = settings_for(
-        tmp_path / "data", tls_certificate=certificate, tls_key=key, max_connections=16, header_seconds=1.0
+        tmp_path / "data", tls_certificate=certificate, tls_key=key, max_connections=16, header_seconds=4.0
     )
     trust = ssl.create_default_context(cafile=str(authority.pem))
     with running(settings, trust) as api, contextlib.ExitStack() as silent:
