@@ -106,10 +106,36 @@ class Settings(BaseSettings):
         default=30.0,
         gt=0,
         le=3600,
-        description="Longest pause while a client sends a body; on the whole it must send at least 1 kB a second.",
+        description="Longest pause while a client sends a body, or reads an answer.",
+    )
+    body_pace: int = Field(
+        default=1024,
+        ge=1,
+        description="Bytes per second that a client must send or read on average, after the first "
+        "`FLEETMAP_BODY_SECONDS`; a slower one gets 408, or its connection is closed.",
+    )
+    max_connections: int = Field(
+        default=4096,
+        ge=16,
+        le=1_000_000,
+        description="Maximum number of open connections for each of the workers; the limit of open files is raised for "
+        "them. A quarter is only for clients with a valid token and for addresses that had one in the last 10 minutes. "
+        "When all are taken, the oldest connection without a token is closed; if there is none, new ones get 503.",
+    )
+    max_connections_per_address: int = Field(
+        default=512,
+        ge=1,
+        le=1_000_000,
+        description="Maximum number of connections from one address that have not shown a valid token; beyond it the "
+        "oldest is closed. Loopback addresses have no such limit. Behind a proxy on another machine: the value of "
+        "`FLEETMAP_MAX_CONNECTIONS`.",
     )
     token_failures: int = Field(
-        default=20, ge=1, le=10_000, description="Wrong tokens a minute from one address before it is answered 429."
+        default=20,
+        ge=1,
+        le=10_000,
+        description="Wrong tokens a minute from one address before further wrong ones get 429; a valid token is always "
+        "accepted.",
     )
 
     zenoh_mode: Literal["router", "client", "off"] = Field(

@@ -5,6 +5,9 @@ A link is the map's address with two more query parameters: ``expires`` (seconds
 in the order of their names, and the expiry. The id makes a link end with its environment, also where another
 environment gets the same name. The secrets are a file that only the server reads; all processes of a data folder share
 it.
+
+A link that was seen to be over stays so, also where the clock is set back: each secret has the latest expiry
+that was seen to have passed, and its links that expire no later are refused.
 """
 
 from __future__ import annotations
@@ -14,16 +17,19 @@ import fcntl
 import hashlib
 import hmac
 import json
+import logging
 import os
 import secrets
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import parse_qsl, urlencode
 
 from app.errors import ExpiredLink, InvalidLink
+
+log = logging.getLogger(__name__)
 
 EXPIRES = "expires"
 SIGNATURE = "signature"
@@ -91,26 +97,24 @@ def sign(secret: bytes, environment_id: str, path: str, parameters: Mapping[str,
     return f"{query.decode()}&{ending}" if query else ending
 
 
-def check(keys: list[bytes], address: SignedAddress, now: float) -> None:
-    """Check a link's signature against each valid secret, in constant time, then its expiry.
+def check(keys: list[bytes], address: SignedAddress) -> int:
+    """Check a link's signature against each valid secret, in constant time; the index of its secret.
 
-    Raises:
-        InvalidLink: it was altered, or was not made by this server.
-        ExpiredLink: it is genuine, but its time is over.
+    Raises InvalidLink: it was altered, or was not made by this server.
     """
     environment_id, _, code = address.signature.partition(".")
     given = code.encode("utf-8", "surrogatepass")
-    genuine = False
-    for secret in keys:
+    found = -1
+    for index, secret in enumerate(keys):
         expected = _code(secret, environment_id, address.path, address.query, address.expires).encode()
-        genuine |= hmac.compare_digest(expected, given)
-    if not genuine:
+        if hmac.compare_digest(expected, given):
+            found = index
+    if found < 0:
         raise InvalidLink(
             "the link's signature does not match its address: it was altered, its secret is no longer valid, or "
             "another server made it; use it exactly as it was given, or request a new one"
         )
-    if address.expires <= now:
-        raise ExpiredLink("the link has expired: request a new one")
+    return found
 
 
 def _canonical(parameters: Mapping[str, str]) -> bytes:
@@ -125,10 +129,13 @@ def _code(secret: bytes, environment_id: str, path: str, query: bytes, expires: 
 
 @dataclass(frozen=True, slots=True)
 class _Secret:
-    """until: seconds since 1970 up to which links made with it are valid; None for the newest."""
+    """until: seconds since 1970 up to which links made with it are valid; None for the newest. over: latest expiry
+    of its links that was seen to have passed.
+    """
 
     value: bytes
     until: float | None
+    over: float = 0.0
 
 
 class LinkSecrets:
@@ -143,16 +150,59 @@ class LinkSecrets:
         """The secret that signs."""
         return self._load()[0].value
 
+    def signing(self, now: float, expires: float) -> bytes:
+        """The secret for a link that expires then; a new one if it would be refused.
+
+        That happens after the clock was set back. All older links end.
+        """
+        newest = self._load()[0]
+        if now < expires <= newest.over:
+            log.warning("links: replaced the secret, for the clock was set back; all older links end")
+            with self._exclusive():
+                if self._read()[0].value == newest.value:
+                    self._write([_new_secret()])
+        return self.newest()
+
+    def check(self, address: SignedAddress, now: float) -> None:
+        """Check a link.
+
+        Raises:
+            InvalidLink: it was altered, its secret is no longer valid, or another server made it.
+            ExpiredLink: it is genuine, but its time is over, or was once.
+        """
+        secrets = self._valid(now)
+        secret = secrets[check([s.value for s in secrets], address)]
+        if now < address.expires and secret.over < address.expires:
+            return
+        if secret.over < address.expires:
+            self._change(lambda s: replace(s, over=max(s.over, address.expires)) if s.value == secret.value else s)
+        raise ExpiredLink("the link has expired: request a new one")
+
     def valid(self, now: float) -> list[bytes]:
         """All secrets whose links are still accepted, the newest first."""
-        return [s.value for s in self._load() if s.until is None or now < s.until]
+        return [s.value for s in self._valid(now)]
 
     def rotate(self, now: float, seconds: float) -> None:
         """Sign with a new secret from now on; the old one stays valid for ``seconds``, until its links have ended."""
         with self._exclusive():
-            old = [_Secret(s.value, now + seconds if s.until is None else s.until) for s in self._read()]
+            old = [replace(s, until=now + seconds) if s.until is None else s for s in self._read()]
             kept = [s for s in old if s.until is not None and now < s.until]
             self._write([_new_secret(), *kept][:MAX_SECRETS])
+
+    def _valid(self, now: float) -> list[_Secret]:
+        """The valid secrets; those whose time is over are deleted, so that no change of the clock revives them."""
+        found = self._load()
+        if any(s.until is not None and s.until <= now for s in found):
+            self._change(lambda s: s if s.until is None or now < s.until else None)
+        return [s for s in found if s.until is None or now < s.until]
+
+    def _change(self, change: Callable[[_Secret], _Secret | None]) -> None:
+        """Change each secret in the file, or delete it. If that fails it is done when the need is seen again."""
+        try:
+            with self._exclusive():
+                self._write([changed for s in self._read() if (changed := change(s)) is not None])
+        except OSError as error:
+            log.warning("links: the end of a link or secret could not be stored (%s)", error.strerror)
 
     def _load(self) -> list[_Secret]:
         with self._lock:
@@ -177,11 +227,11 @@ class LinkSecrets:
             lines = json.loads(self._file.read_bytes())
         except FileNotFoundError:
             return []
-        return [_Secret(base64.b64decode(line["secret"]), line["until"]) for line in lines]
+        return [_Secret(base64.b64decode(line["secret"]), line["until"], line.get("over", 0.0)) for line in lines]
 
     def _write(self, lines: list[_Secret]) -> None:
         """Replace the file as a whole, readable by its owner only."""
-        body = [{"secret": base64.b64encode(s.value).decode(), "until": s.until} for s in lines]
+        body = [{"secret": base64.b64encode(s.value).decode(), "until": s.until, "over": s.over} for s in lines]
         temporary = self._file.with_suffix(f".{os.getpid()}")
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
         with os.fdopen(descriptor, "w") as handle:

@@ -57,12 +57,13 @@ from app.api import (
 )
 from app.api.access import Access
 from app.api.answers import API
+from app.api.connections import ConnectionLimits, Connections, fit_open_files
 from app.api.deltas import Deltas
 from app.api.guard import Guard
 from app.api.jobs import BEAT_SECONDS, Work
 from app.api.maps import Hot, Server
 from app.api.metrics import Metrics
-from app.api.protocol import BoundedProtocol
+from app.api.protocol import BoundedProtocol, tls_context
 from app.api.services import ApiOptions, Services
 from app.api.signed import SignedLinks
 from app.api.uploads import Intake
@@ -89,6 +90,9 @@ log = logging.getLogger(__name__)
 
 TICK_SECONDS = 1.0
 """How late a planned move of a channel may come."""
+
+CLOCK_TOLERANCE = timedelta(seconds=60)
+"""How far the clock may go back without a word in the log."""
 
 COLLECT_EVERY = timedelta(hours=24)
 COLLECT_GRACE = timedelta(hours=6)
@@ -176,7 +180,7 @@ def from_environment() -> Server:
 
 
 def server_config(settings: Settings, app: Any = "app.main:from_environment", **more: Any) -> uvicorn.Config:
-    """uvicorn as this server needs it: fast loop and parser, bounded heads, no access log, no version in headers.
+    """uvicorn as this server needs it: fast loop and parser, bounded connections, no access log, no version in headers.
 
     app: an application, or the import string of a factory (needed for several workers, who read the settings from the
     environment: ``os.environ.update(settings.as_environment())`` first).
@@ -186,12 +190,23 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         os.environ["PROMETHEUS_MULTIPROC_DIR"] = str(folder.resolve())
+    limits = ConnectionLimits(
+        total=fit_open_files(settings.max_connections),
+        per_address=settings.max_connections_per_address,
+        head_seconds=settings.header_seconds,
+        stall_seconds=settings.body_seconds,
+        pace=settings.body_pace,
+    )
+    tls = None
+    if settings.tls_certificate is not None and settings.tls_key is not None:
+        tls = settings.tls_certificate, settings.tls_key
+        tls_context(*tls)  # a file that cannot be used is reported at the start
     options: dict[str, Any] = {
         "factory": isinstance(app, str),
         "host": settings.host,
         "port": settings.port,
         "workers": settings.workers,
-        "http": BoundedProtocol,
+        "http": partial(BoundedProtocol, Connections(limits), tls),
         "loop": "uvloop" if _has_uvloop() else "auto",
         "ws": "none",
         "lifespan": "on",
@@ -203,11 +218,7 @@ def server_config(settings: Settings, app: Any = "app.main:from_environment", **
         # Uvicorn's 5 s end workers that are still starting on a busy machine, again and again.
         "timeout_worker_healthcheck": 120,
     }
-    if settings.tls_certificate is not None:
-        options |= {"ssl_certfile": str(settings.tls_certificate), "ssl_keyfile": str(settings.tls_key)}
-    config = uvicorn.Config(app, **{**options, **more})
-    config.head_seconds = settings.header_seconds  # type: ignore[attr-defined]  # read by BoundedProtocol
-    return config
+    return uvicorn.Config(app, **{**options, **more})
 
 
 def _has_uvloop() -> bool:
@@ -281,6 +292,7 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
             spool_dir=settings.spool_dir,
             max_json_bytes=settings.max_json_bytes,
             body_seconds=settings.body_seconds,
+            body_pace=settings.body_pace,
             insecure_no_auth=settings.insecure_no_auth,
             data_dir=settings.data_dir,
             zenoh_mode=settings.zenoh_mode,
@@ -440,15 +452,29 @@ def _first_token(store: Store, settings: Settings) -> None:
         print(f"administrator's token, shown only this once: {made}", file=sys.stdout, flush=True)
 
 
+def _note_time(newest: datetime) -> datetime:
+    """The present; a clock that was set back is reported."""
+    now = datetime.now(UTC)
+    if newest - now > CLOCK_TOLERANCE:
+        log.warning(
+            "clock: set back by %d s; expired tokens and links stay expired: replace those that expired too early",
+            (newest - now).total_seconds(),
+        )
+    return now
+
+
 async def _tick(here: Services) -> None:
-    """Planned moves and roll-outs of channels, ends of overlays, signs of life of jobs, and the daily clean-up."""
+    """Ends of tokens and overlays, planned moves and roll-outs, signs of life of jobs, and the daily clean-up."""
     beat = 0.0
-    collect = datetime.now(UTC) + COLLECT_EVERY
+    newest = datetime.now(UTC)
+    collect = newest + COLLECT_EVERY
     while True:
         await asyncio.sleep(TICK_SECONDS)
         beat += TICK_SECONDS
         try:
             here.hot.count()
+            newest = _note_time(newest)
+            await run_in_threadpool(here.store.end_expired_tokens)
             await run_in_threadpool(here.store.apply_due, datetime.now(UTC))
             await run_in_threadpool(here.store.advance_rollouts, datetime.now(UTC), decide)
             await run_in_threadpool(here.store.end_due_overlays, datetime.now(UTC))

@@ -133,20 +133,19 @@ class Access:
     def check(self, header: bytes | None, client: str | None) -> Principal:
         """Who sent this header. Asks the store, so call it from a thread.
 
-        Raises Unauthenticated, or Throttled where too many wrong tokens came from the client's address.
+        A valid token is accepted also from an address that sent too many wrong ones: many robots share an address.
+
+        Raises Unauthenticated; Throttled for a wrong token after too many from the client's address.
         """
         known = self.known(header)
         if known is not None:
             return known
-        source = source_of(client)
-        if self._failed(source) >= self._failures:
-            raise Throttled("too many wrong tokens came from your address: wait a minute and use a valid one")
         if header is None:
             raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
         forgotten = self.forgotten
         token = self._find(_token(header)) if _token(header) else None
         if token is None or (token.expires is not None and token.expires <= datetime.now(UTC)):
-            self._note_failure(source)
+            self.note_failure(client)
             raise Unauthenticated("the token is unknown or has expired: ask an administrator for a new one")
         principal = Principal.of(token)
         with self._lock:
@@ -162,24 +161,20 @@ class Access:
             self.forgotten += 1
             self._known.clear()
 
-    def note_guess(self, client: str | None) -> None:
-        """Count a signature that no secret made, like a wrong token. Throttled after too many from this address."""
+    def note_failure(self, client: str | None) -> None:
+        """Count a wrong token or signature; Throttled after too many from this address within a minute."""
         source = source_of(client)
-        if self._failed(source) >= self._failures:
-            raise Throttled("too many wrong signatures or tokens came from your address: wait a minute")
-        self._note_failure(source)
-
-    def _failed(self, source: str) -> int:
         with self._lock:
-            times = self._sources.get(source)
-            while times and times[0] < self._clock() - WINDOW_SECONDS:
-                times.popleft()
-            return len(times) if times else 0
-
-    def _note_failure(self, source: str) -> None:
-        with self._lock:
+            now = self._clock()
             times = self._sources.setdefault(source, deque(maxlen=self._failures))
-            times.append(self._clock())
+            while times and times[0] < now - WINDOW_SECONDS:
+                times.popleft()
+            if len(times) >= self._failures:
+                raise Throttled(
+                    "too many wrong tokens or signatures came from your address: wait a minute, or send a valid token, "
+                    "which is accepted at any time"
+                )
+            times.append(now)
             self._sources.move_to_end(source)
             while len(self._sources) > MAX_SOURCES:
                 self._sources.popitem(last=False)
@@ -198,21 +193,30 @@ def _token(header: bytes) -> str:
 
 
 def source_of(client: str | None) -> str:
-    """What counts as one source: an IPv4 address, the /64 of an IPv6 one."""
+    """What counts as one source: an IPv4 address (also one mapped into IPv6), the /64 of an IPv6 one."""
     try:
         address = ipaddress.ip_address(client or "")
     except ValueError:
         return client or ""
     if isinstance(address, ipaddress.IPv6Address):
-        return str(ipaddress.ip_network((int(address) >> 64 << 64, 64)))
+        if address.ipv4_mapped is not None:
+            return str(address.ipv4_mapped)
+        if not address.is_loopback:
+            return str(ipaddress.ip_network((int(address) >> 64 << 64, 64)))
     return str(address)
+
+
+def is_loopback(source: str) -> bool:
+    """Whether a source is this machine itself."""
+    return source == "::1" or (source.startswith("127.") and "/" not in source)
 
 
 @dataclass(frozen=True, slots=True)
 class AtLeast:
-    """A route's dependency: the caller, who must have at least this role."""
+    """A route's dependency: the caller, who must have at least this role; everywhere: in all environments."""
 
     need: Need
+    everywhere: bool = False
 
     async def __call__(self, request: Request) -> Principal:
         """The caller; Denied where the role does not suffice."""
@@ -220,6 +224,8 @@ class AtLeast:
         if not isinstance(principal, Principal):
             raise Unauthenticated("this call needs a token: send 'Authorization: Bearer <token>'")
         principal.demand(self.need)
+        if self.everywhere:
+            principal.demand_everywhere()
         return principal
 
 
@@ -229,3 +235,6 @@ Viewer = Annotated[Principal, Depends(viewer)]
 Reporter = Annotated[Principal, Depends(robot)]
 Editor = Annotated[Principal, Depends(editor)]
 Admin = Annotated[Principal, Depends(admin)]
+ServerViewer = Annotated[Principal, Depends(AtLeast("viewer", everywhere=True))]
+ServerAdmin = Annotated[Principal, Depends(AtLeast("admin", everywhere=True))]
+"""For what concerns the server itself or all environments: tokens, keys, metrics."""

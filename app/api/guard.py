@@ -6,22 +6,22 @@ Plain ASGI: it costs a few microseconds and lets bodies stream.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import re
 import secrets
 import time
-from typing import Any
 from urllib.parse import urlsplit
 
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api import problems
 from app.api.access import Principal, environment_of, is_open
 from app.api.answers import API
 from app.api.problems import MalformedBody, SlowBody, UnsupportedMedia
+from app.api.protocol import PROVE
 from app.api.services import Services
 from app.api.signed import LINK, signed_address
 from app.api.together import Together
@@ -35,13 +35,6 @@ MULTIPART_OVERHEAD = 2**20
 """Bytes that a multipart body may have beside its files: field values, plus the parts' heads."""
 
 PART_OVERHEAD = 1024
-MIN_PACE = 1024
-"""Bytes a second that a client must send on the whole."""
-
-DRAIN_BYTES = 32 * 2**20
-DRAIN_SECONDS = 5.0
-"""How much of a refused body is still taken in, so that the client reads the answer before it sees a closed door."""
-
 _BODY = frozenset({"POST", "PUT", "PATCH"})
 _METHODS = frozenset({"GET", "DELETE", "OPTIONS", *_BODY})
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
@@ -110,13 +103,18 @@ class Guard:
         headers = _headers(scope)
         if here.options.insecure_no_auth:
             _only_from_here(headers)
-        if not is_open(scope["path"]):
-            principal = await self._principal(scope, headers, here)
-            environment = environment_of(scope["path"])
-            if environment is not None:
-                principal.enter(environment)
-            scope["state"]["principal"] = principal
-            CALLER.set(_caller(scope, principal, environment))
+        if is_open(scope["path"]):
+            # Anybody can send a body: it is not read before it is known who takes it.
+            await self._app(scope, body, answer)
+            return
+        principal = await self._principal(scope, headers, here)
+        if PROVE in scope["state"]:
+            scope["state"][PROVE]()
+        environment = environment_of(scope["path"])
+        if environment is not None:
+            principal.enter(environment)
+        scope["state"]["principal"] = principal
+        CALLER.set(_caller(scope, principal, environment))
         if scope["method"] in _BODY and body.begin(scope, headers):
             await body.preload()
         await self._app(scope, body, answer)
@@ -135,12 +133,10 @@ class Guard:
             principal = await self._checks.run(key, here.access.check, authorization, client)
         return principal
 
-    async def _refuse(self, response: Any, scope: Scope, body: _Body, answer: _Answer) -> None:
+    async def _refuse(self, response: Response, scope: Scope, body: _Body, answer: _Answer) -> None:
         if answer.started:
             # Half an answer is out: the only honest end is a broken connection.
             raise ConnectionAbortedError("the answer could not be finished")
-        if not await body.drain():
-            response.headers["connection"] = "close"
         await response(scope, body, answer)
 
 
@@ -243,7 +239,6 @@ class _Body:
     __slots__ = (
         "_begun",
         "_declared",
-        "_expects",
         "_here",
         "_limit",
         "_loaded",
@@ -258,13 +253,11 @@ class _Body:
         self._limit = here.options.max_json_bytes
         self._received, self._begun, self._whole = 0, time.monotonic(), False
         self._declared: int | None = 0
-        self._expects = False
         self._loaded: Message | None = None
         self.what = "request body"
 
     def begin(self, scope: Scope, headers: dict[bytes, bytes]) -> bool:
         """Look at what is announced (coding, media type, length): whether the body is one to be read as a whole."""
-        self._expects = headers.get(b"expect", b"").lower() == b"100-continue"
         coding = headers.get(b"content-encoding", b"identity").strip().lower()
         length = headers.get(b"content-length")
         self._declared = int(length) if length is not None and length.isdigit() else None
@@ -305,14 +298,14 @@ class _Body:
             return message
         if self._declared == 0 or self._whole:
             return await self._receive()
-        pace = self._here.options.body_seconds
-        late = self._begun + pace + self._received / MIN_PACE - time.monotonic()
+        pause, pace = self._here.options.body_seconds, self._here.options.body_pace
+        late = self._begun + pause + self._received / pace - time.monotonic()
         try:
-            async with asyncio.timeout(min(pace, max(0.001, late))):
+            async with asyncio.timeout(min(pause, max(0.001, late))):
                 message = await self._receive()
         except TimeoutError:
             raise SlowBody(
-                f"the {self.what} stopped coming, or comes at less than {MIN_PACE} bytes a second: send it again"
+                f"the {self.what} stopped coming, or comes at less than {pace} bytes a second: send it again"
             ) from None
         if message["type"] == "http.disconnect":
             raise _Disconnected
@@ -324,28 +317,6 @@ class _Body:
 
     def _too_large(self) -> TooLarge:
         return TooLarge(f"the {self.what} is larger than {self._limit} bytes, the most that this server takes")
-
-    async def drain(self) -> bool:
-        """Take in the rest of a refused body, within reason: whether all of it came."""
-        if self._whole or self._declared == 0:
-            return True
-        if self._expects and self._received == 0:
-            return False  # it has not been sent yet, and now never will
-        if self._declared is not None and self._declared - self._received > DRAIN_BYTES:
-            budget = DRAIN_BYTES // 8
-        else:
-            budget = DRAIN_BYTES
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(DRAIN_SECONDS):
-                while budget > 0:
-                    message = await self._receive()
-                    if message["type"] == "http.disconnect":
-                        return False
-                    budget -= len(message.get("body", b""))
-                    if not message.get("more_body", False):
-                        self._whole = True
-                        return True
-        return False
 
 
 def takes_files(path: str) -> bool:

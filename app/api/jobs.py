@@ -22,7 +22,7 @@ from app.api.schemas import JobOut, JobPath, told
 from app.api.services import Here
 from app.convert import Maps, Recipe
 from app.convert.cache import Made
-from app.errors import Denied, FleetMapError, Unavailable
+from app.errors import FleetMapError, NotFound, Unavailable
 from app.pool import Cancelled, Stop
 from app.store import Store
 from app.store.values import Job, rfc3339
@@ -204,15 +204,18 @@ router = APIRouter(prefix="/jobs", tags=["jobs"], route_class=Route)
 
 
 def _mine(here: Here, who: Principal, id: str) -> Job:
+    """A job that the caller may see; NotFound for all others, as if there were none."""
     job = here.store.job(id)
-    if job.owner != who.id and who.role != "admin":
-        raise Denied("this job was started with another token")
+    if job.owner != who.id and not (who.can("admin") and who.environments is None):
+        raise NotFound(f"there is no job {id[:80]!r}")
     return job
 
 
 @router.get("/{id}", responses=told(JobOut, 404), summary="How far a job is")
 def get_job(id: JobPath, here: Here, who: Viewer) -> Response:
-    """A job of the own token; administrators see all. ``result.location`` is where a finished map is had."""
+    """A job of the own token; an administrator of all environments sees all. ``result.location`` is where a
+    finished map is had.
+    """
     return answer(as_dict(_mine(here, who, id)))
 
 

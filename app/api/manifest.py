@@ -16,7 +16,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app import formats
-from app.api.access import Admin, Viewer
+from app.api.access import ServerAdmin, Viewer
 from app.api.answers import Route, answer, json_bytes
 from app.api.caching import none_match
 from app.api.jobs import Started, started
@@ -55,8 +55,9 @@ def list_keys(here: Here, _: Viewer) -> Response:
 @router.post(
     "/keys", status_code=201, responses=told(KeyOut, ok=201, description="The new key"), summary="Rotate the key"
 )
-def rotate_key(here: Here, _: Admin) -> Response:
-    """From now on a new key signs. Robots that trust the old one follow, since it vouches for the new one.
+def rotate_key(here: Here, _: ServerAdmin) -> Response:
+    """From now on a new key signs. Robots that trust the old one follow, since it vouches for the new one. Takes a
+    token for all environments.
 
     Signed links get a new secret as well; links that were made before stay valid until they expire.
     """

@@ -31,6 +31,7 @@ from app.api.caching import Unsatisfiable, byte_range, content_disposition, none
 from app.api.guard import is_from_here
 from app.api.jobs import Started, started
 from app.api.metrics import Metrics
+from app.api.protocol import PROVE
 from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut, VersionPath, told
 from app.api.services import Here, Services
 from app.api.signed import LINK
@@ -419,6 +420,8 @@ class Server(FastAPI):
             if found is not None:
                 reply = _reply(hot, found, scope["headers"], scope["method"] == "HEAD")
                 if reply is not None:
+                    if PROVE in scope.get("state", ()):
+                        scope["state"][PROVE]()
                     await send(reply[0])
                     await send(reply[1])
                     return

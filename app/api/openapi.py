@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from app import formats, parameters
-from app.api.access import AtLeast, is_open
+from app.api.access import is_open
 from app.api.answers import API
 from app.api.problems import MEDIA_TYPE
 from app.api.schemas import ProblemOut, RevertBody, told
@@ -338,16 +338,3 @@ def _header_parameters() -> list[dict[str, Any]]:
         {"name": name, "in": "header", "description": text, "schema": {"type": "string"}}
         for name, text in texts.items()
     ]
-
-
-def unguarded(app: FastAPI) -> list[str]:
-    """Routes under the API that declare no role: there must be none."""
-    out = []
-    for route in app.routes:
-        dependant = getattr(route, "dependant", None)
-        path = getattr(route, "path", "")
-        if dependant is None or is_open(path):
-            continue
-        if not any(isinstance(inner.call, AtLeast) for inner in dependant.dependencies):
-            out.append(path)
-    return out

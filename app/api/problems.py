@@ -153,8 +153,6 @@ def of_error(error: errors.FleetMapError) -> Response:
         headers["retry-after"] = str(error.retry_after)
     elif status == 503:
         headers["retry-after"] = str(RETRY_SECONDS)
-    elif isinstance(error, SlowBody):
-        headers["connection"] = "close"
     if isinstance(error, errors.Damaged):
         # The operator's alarm; the client learns only that it was not its fault.
         log.critical("stored data is damaged: %s", error.detail)

@@ -922,6 +922,7 @@ class TokenOut(BaseModel):
     robot: str | None
     expires: datetime | None
     created: datetime
+    ended: datetime | None = Field(description="When it was seen to have expired; it stays expired.")
 
 
 class AuditTokenOut(BaseModel):

@@ -35,6 +35,7 @@ class ApiOptions:
     spool_dir: Path
     max_json_bytes: int = 64 * 2**20
     body_seconds: float = 30.0
+    body_pace: int = 1024
     insecure_no_auth: bool = False
     data_dir: Path = Path("data")
     zenoh_mode: str = "off"

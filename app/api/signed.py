@@ -72,10 +72,11 @@ class SignedLinks:
         self, environment: Environment, path: str, parameters: Mapping[str, str], seconds: int, creator: Principal
     ) -> Grant:
         """Make a link to a map's path (percent-decoded). It does not outlive the token of its creator."""
-        expires = int(self._clock()) + min(seconds, self.max_seconds)
+        now = self._clock()
+        expires = int(now) + min(seconds, self.max_seconds)
         if creator.expires is not None:
             expires = min(expires, int(creator.expires.timestamp()))
-        query = links.sign(self._secrets.newest(), environment.id, path, parameters, expires)
+        query = links.sign(self._secrets.signing(now, expires), environment.id, path, parameters, expires)
         return Grant(f"{quote(path, safe='/')}?{query}", datetime.fromtimestamp(expires, UTC))
 
     def check(self, address: SignedAddress, client: str | None) -> Principal:
@@ -90,9 +91,9 @@ class SignedLinks:
         """
         now = self._clock()
         try:
-            links.check(self._secrets.valid(now), address, now)
+            self._secrets.check(address, now)
         except InvalidLink:
-            self._access.note_guess(client)
+            self._access.note_failure(client)
             raise
         found = _MAP.fullmatch(address.path)
         name = (found["long"] or found["short"]) if found else ""

@@ -8,7 +8,7 @@ from typing import Any
 from fastapi import APIRouter
 from starlette.responses import Response
 
-from app.api.access import Admin
+from app.api.access import ServerAdmin
 from app.api.answers import Route, answer
 from app.api.schemas import NewTokenOut, TokenBody, TokenOut, TokenPath, told
 from app.api.services import Here
@@ -29,13 +29,13 @@ def as_dict(token: Token) -> dict[str, Any]:
         "robot": token.robot,
         "expires": rfc3339(token.expires) if token.expires else None,
         "created": rfc3339(token.created),
+        "ended": rfc3339(token.ended) if token.ended else None,
     }
 
 
 @router.get("", responses=told(list[TokenOut]), summary="All tokens, without their secrets")
-def list_tokens(here: Here, who: Admin) -> Response:
+def list_tokens(here: Here, _: ServerAdmin) -> Response:
     """Oldest first."""
-    who.demand_everywhere()
     return answer([as_dict(token) for token in here.store.tokens()])
 
 
@@ -45,12 +45,11 @@ def list_tokens(here: Here, who: Admin) -> Response:
     responses=told(NewTokenOut, 400, 415, ok=201, description="Made"),
     summary="Make a token",
 )
-def create_token(body: TokenBody, here: Here, who: Admin) -> Response:
+def create_token(body: TokenBody, here: Here, _: ServerAdmin) -> Response:
     """Its secret stands in this answer and nowhere else: only its hash is stored.
 
     A token with the role `robot` names its robot: `robot`, by default its own `name`.
     """
-    who.demand_everywhere()
     if body.expires is not None:
         if body.expires.tzinfo is None:
             raise Invalid("expires needs a zone, like 2030-01-31T06:00:00Z", [Problem("no zone", where="expires")])
@@ -79,9 +78,8 @@ def _robot_of(body: TokenBody) -> str | None:
 
 
 @router.delete("/{id}", status_code=204, responses=told(None, 404, 409), summary="Revoke a token")
-def delete_token(id: TokenPath, here: Here, who: Admin) -> Response:
+def delete_token(id: TokenPath, here: Here, _: ServerAdmin) -> Response:
     """It is refused from now on (within a second by other worker processes). The last administrator's stays."""
-    who.demand_everywhere()
     known = {token.id: token for token in here.store.tokens()}
     if id not in known:
         raise NotFound("there is no token with this id")

@@ -323,6 +323,7 @@ token = Table(
     Column("robot", Text, nullable=True),
     Column("expires", Moment, nullable=True),
     Column("created", Moment, nullable=False),
+    Column("ended", Moment, nullable=True),
 )
 
 job = Table(

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import logging
 import secrets
 from datetime import datetime
 from typing import Any, Final, get_args
 
-from sqlalchemy import Row, delete, insert, select
+from sqlalchemy import Row, delete, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
-from app.errors import Conflict, Invalid, NotFound
+from app.errors import Conflict, Invalid, NotFound, Unavailable
 from app.store import tables
 from app.store.base import Base, text, utcnow
-from app.store.values import Role, Token
+from app.store.values import Role, Token, rfc3339
+
+log = logging.getLogger(__name__)
 
 SECRET_BYTES: Final = 32
 
@@ -100,7 +103,25 @@ class Tokens(Base):
         if row is None or not hmac.compare_digest(row.hash, wanted):
             return None
         found = _as_token(row)
-        return None if found.expires is not None and found.expires <= utcnow() else found
+        if found.ended is None and found.expires is not None and found.expires <= utcnow():
+            try:
+                self.end_expired_tokens()
+            except Unavailable as error:  # it is refused all the same, and noted when it is seen again
+                log.warning("tokens: the end of an expired token could not be stored (%s)", error.detail)
+            return None
+        return None if found.ended is not None else found
+
+    def end_expired_tokens(self) -> int:
+        """Note which tokens have expired, and return how many: they stay so, also where the clock is set back."""
+        table, now = tables.token, utcnow()
+        expired = table.c.ended.is_(None) & (table.c.expires <= now)
+        with self._database.read() as connection:
+            if connection.execute(select(table.c.id).where(expired).limit(1)).first() is None:
+                return 0
+        with self._database.write() as connection:
+            count = int(connection.execute(update(table).where(expired).values(ended=now)).rowcount)
+        log.info("tokens: expired (count=%d, time=%s)", count, rfc3339(now))
+        return count
 
 
 def _hash(secret: str) -> str:
@@ -108,4 +129,4 @@ def _hash(secret: str) -> str:
 
 
 def _as_token(row: Row[Any]) -> Token:
-    return Token(row.id, row.name, row.role, row.environments, row.robot, row.expires, row.created)
+    return Token(row.id, row.name, row.role, row.environments, row.robot, row.expires, row.created, row.ended)

@@ -401,7 +401,10 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """An access token without its secret. environments: a name pattern (fnmatch), None for all."""
+    """An access token without its secret.
+
+    environments: a name pattern (fnmatch), None for all. ended: when it was seen to have expired; it stays expired.
+    """
 
     id: str
     name: str
@@ -410,6 +413,7 @@ class Token:
     robot: str | None
     expires: datetime | None
     created: datetime
+    ended: datetime | None = None
 
 
 @dataclass(frozen=True, slots=True)

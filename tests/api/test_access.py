@@ -6,7 +6,16 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from app.api.access import FRESH_SECONDS, WINDOW_SECONDS, Access, Principal, environment_of, is_open, source_of
+from app.api.access import (
+    FRESH_SECONDS,
+    WINDOW_SECONDS,
+    Access,
+    Principal,
+    environment_of,
+    is_loopback,
+    is_open,
+    source_of,
+)
 from app.api.problems import Throttled
 from app.errors import Denied, Unauthenticated
 from app.store.values import Role, Token
@@ -88,10 +97,14 @@ def test_guessing_is_slowed_for_its_source_alone() -> None:
     for _ in range(3):
         with pytest.raises(Unauthenticated):
             access.check(b"Bearer wrong", "10.0.0.1")
-    asked = book.asked
-    with pytest.raises(Throttled):
+    with pytest.raises(Throttled, match="accepted at any time"):
         access.check(b"Bearer wrong", "10.0.0.1")
-    assert book.asked == asked
+    with pytest.raises(Throttled):
+        access.note_failure("::ffff:10.0.0.1")  # a wrong signature of a link
+    with pytest.raises(Unauthenticated):
+        access.check(None, "10.0.0.1")
+    book.tokens["other"] = token("robot")
+    assert access.check(b"Bearer other", "10.0.0.1").role == "robot", "robots behind one NAT share its address"
     assert access.check(b"Bearer good", "10.0.0.1"), "a token that was good a moment ago stays good"
     assert access.check(b"Bearer good", "10.0.0.2")
     with pytest.raises(Unauthenticated):
@@ -112,6 +125,10 @@ def test_asking_without_a_token_is_no_failure() -> None:
 def test_sources() -> None:
     assert source_of("10.0.0.1") == "10.0.0.1"
     assert source_of("2001:db8::1") == source_of("2001:db8::2") != source_of("2001:db9::1")
+    assert source_of("::ffff:10.0.0.1") == "10.0.0.1", "an IPv4 client of a server that listens on ::"
+    assert is_loopback(source_of("::1"))
+    assert is_loopback(source_of("127.1.2.3"))
+    assert not is_loopback(source_of("::"))
     assert source_of(None) == ""
     assert source_of("testclient") == "testclient"
 

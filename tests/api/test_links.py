@@ -44,12 +44,12 @@ def test_signature_holds_for_parameters_in_any_order() -> None:
         found = links.parse("/maps/farm/kml", urlencode(order).encode())
         assert found is not None
         assert (found.query, found.expires, found.environment_id) == (b"a=1&b=2+%26%C3%A9", int(NOW) + 9, "e1")
-        links.check([b"other", b"k"], found, NOW)
+        assert links.check([b"other", b"k"], found) == 1
 
 
 def test_signature_covers_path_parameters_expiry_and_environment() -> None:
     good = signed(b"k", "/maps/farm/kml", int(NOW) + 9, a="1")
-    links.check([b"k"], good, NOW)
+    assert links.check([b"k"], good) == 0
     e1, _, code = good.signature.partition(".")
     altered: list[dict[str, Any]] = [
         {"path": "/maps/farm/kmz"}, {"path": "/maps/farm/kml/map.kml"}, {"query": b""}, {"query": b"a=2"},
@@ -59,19 +59,38 @@ def test_signature_covers_path_parameters_expiry_and_environment() -> None:
     for change in altered:
         values = {name: getattr(good, name) for name in ("path", "query", "expires", "signature")} | change
         with pytest.raises(InvalidLink):
-            links.check([b"k"], links.SignedAddress(**values), NOW)
+            links.check([b"k"], links.SignedAddress(**values))
     with pytest.raises(InvalidLink):
-        links.check([b"j"], good, NOW)
+        links.check([b"j"], good)
     with pytest.raises(InvalidLink):
-        links.check([], good, NOW)
+        links.check([], good)
 
 
-def test_genuine_link_ends_at_its_expiry() -> None:
-    link = signed(b"k", "/maps/farm/kml", int(NOW) + 9)
-    links.check([b"k"], link, NOW + 8.9)
-    for late in (9.0, 10.0, 1e9):
+def test_genuine_link_ends_at_its_expiry_and_stays_expired(tmp_path: Path) -> None:
+    """Also in another process, and where the clock is set back."""
+    secrets = LinkSecrets(tmp_path)
+    link, later = (signed(secrets.newest(), "/maps/farm/kml", int(NOW) + life) for life in (9, 90))
+    secrets.check(link, NOW + 8.9)
+    for clock in (9.0, 10.0, 8.0, -1e6):
         with pytest.raises(ExpiredLink, match="request a new one"):
-            links.check([b"k"], link, NOW + late)
+            LinkSecrets(tmp_path).check(link, NOW + clock)
+    secrets.check(later, NOW)
+
+
+def test_links_made_after_the_clock_was_set_back_are_valid(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Also while they expire before links that were seen to be over: those end for good, with their secret."""
+    secrets = LinkSecrets(tmp_path)
+    old, other = (signed(secrets.newest(), "/maps/farm/kml", int(NOW) + life) for life in (900, 1000))
+    with pytest.raises(ExpiredLink):
+        secrets.check(old, NOW + 1e7)
+    assert secrets.signing(NOW, NOW + 901) == secrets.newest()
+    secrets.check(other, NOW)
+    new = signed(secrets.signing(NOW, NOW + 60), "/maps/farm/kml", int(NOW) + 60)
+    assert "set back" in caplog.text
+    secrets.check(new, NOW)
+    for link in (old, other):
+        with pytest.raises(InvalidLink):
+            LinkSecrets(tmp_path).check(link, NOW)
 
 
 @pytest.mark.parametrize("expires", ["", "x", "-1", "1e9", "١٢٣", "1" * 13, None])
@@ -108,6 +127,7 @@ def test_rotated_secret_stays_valid_until_its_links_have_ended(tmp_path: Path) -
     assert new != old
     assert two.valid(NOW + 59) == one.valid(NOW + 59) == [new, old]
     assert two.valid(NOW + 60) == [new]
+    assert one.valid(NOW) == [new], "its time is over, also where the clock is set back"
     one.rotate(NOW + 61, 60)
     assert [s["until"] for s in json.loads((tmp_path / "links.json").read_text())] == [None, NOW + 121], (
         "old is removed"

@@ -364,7 +364,7 @@ def test_work_that_takes_long_becomes_a_job(tmp_path: Path, monkeypatch: pytest.
         other = api.token_for("viewer")
         api_other = other.get("/maps/farm/tmap2", 202).headers["location"]
         assert api_other != where
-        other.problem("GET", where, 403)
+        other.problem("GET", where, 404)
         gate.set()
         deadline = time.monotonic() + 30
         while (job := api.get(where).json())["state"] == "running":

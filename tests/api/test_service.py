@@ -324,6 +324,11 @@ def test_guessing_is_answered_429(tmp_path: Path) -> None:
         assert int(answer.headers["retry-after"]) > 0
         problem(answer)
         wrong.get("/healthz")
+        for path in ("formats", "environments"):
+            api.as_(None).get(path, headers={"Authorization": f"Bearer {ADMIN}"})
+        late = api.token_for("robot", name="r1")
+        late.get("formats")
+        late("PUT", "robots/r1/status", 422, json={})
 
 
 def test_without_access_control(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 import shapely
@@ -391,8 +392,36 @@ def test_a_plan_that_is_dropped_is_told(store: Store):
     assert Event.from_json(json.dumps(second)).type == "channel.cancelled"
 
 
+def test_expired_token_stays_expired_when_the_clock_is_set_back(
+    store: Store, database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    now = datetime.now(UTC)
+    _, lasting = store.create_token("admin", "admin")
+    _, seen = store.create_token("seen", "viewer", expires=now + timedelta(hours=1))
+    _, unseen = store.create_token("unseen", "viewer", expires=now + timedelta(hours=2))
+    _, long = store.create_token("long", "viewer", expires=now + timedelta(days=2))
+    assert store.find_token(seen) is not None
+    monkeypatch.setattr("app.store.tokens.utcnow", lambda: now + timedelta(hours=1))
+    assert store.find_token(seen) is None
+    monkeypatch.setattr("app.store.tokens.utcnow", lambda: now + timedelta(days=1))
+    assert store.end_expired_tokens() == 1, "nobody has sent it"
+    assert store.end_expired_tokens() == 0
+    monkeypatch.setattr("app.store.tokens.utcnow", lambda: now)
+    other = Store(database_url, tmp_path / "blobs")  # after a restart
+    for each in (store, other):
+        assert each.find_token(seen) is None
+        assert each.find_token(unseen) is None
+        assert each.find_token(lasting) is not None
+        assert each.find_token(long) is not None
+    assert {t.name for t in other.tokens() if t.ended} == {"seen", "unseen"}
+    _, new = other.create_token("new", "viewer", expires=now + timedelta(minutes=1))
+    assert store.find_token(new) is not None, "a clock that was ahead ends no token that is made afterwards"
+    other.close()
+
+
 def test_tokens_are_kept_hashed(store: Store):
     token, secret = store.create_token("ci", "editor", environments="farm-*")
+    assert token.ended is None
     assert len(secret) >= 32
     assert store.find_token(secret) == token
     assert store.find_token(secret + "x") is None
@@ -411,6 +440,7 @@ def test_tokens_are_kept_hashed(store: Store):
     past, old = store.create_token("old", "viewer", expires=datetime.now(UTC) - timedelta(seconds=1))
     assert store.find_token(old) is None
     assert [t.id for t in store.tokens()] == [token.id, chosen.id, past.id]
+    assert [t.ended is None for t in store.tokens()] == [True, True, False]
     store.delete_token(token.id)
     assert store.find_token(secret) is None
     with pytest.raises(NotFound):

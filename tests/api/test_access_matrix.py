@@ -1,0 +1,241 @@
+"""Every route with every kind of token. ``ROWS`` says what is expected; a route without a row fails."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any, Literal, get_args
+
+import httpx
+import pytest
+from starlette.routing import Route
+
+from app.store.values import Role
+from tests.api import samples
+from tests.api.conftest import API, Api, running, settings_for
+
+FARM, ABSENT, OTHERS = "farm", "farm-of-nobody", "street*"
+"""An environment, a name that none has, and the pattern of the limited tokens, which reach neither."""
+
+INCLUDES: dict[str, set[str]] = {
+    "viewer": {"viewer", "robot", "editor", "admin"},
+    "robot": {"robot", "editor", "admin"},
+    "editor": {"editor", "admin"},
+    "admin": {"admin"},
+}
+Scope = Literal["environment", "server", "filtered", "job", "open"]
+"""Where a token that is limited to other environments has no access.
+
+environment: one that the request names (403, whether or not it exists). server: all environments or the server itself
+(403). filtered: the answer leaves out what the token does not reach. job: only the token's own (404). open: no token is
+needed.
+"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A request and who may send it. ``{env}`` and ``{job}`` are replaced. creates: sent with the existing name."""
+
+    request: str
+    role: Role | None
+    scope: Scope
+    body: Any = None
+    query: str = ""
+    own_robot: bool = False
+    creates: bool = False
+
+
+def rows(scope: Scope, **roles: str) -> list[Row]:
+    """Rows without bodies: ``role="METHOD path, METHOD path"``."""
+    known: dict[str, Role] = {role: role for role in get_args(Role)}
+    return [Row(line.strip(), known.get(role), scope) for role, text in roles.items() for line in text.split(",")]
+
+
+E = f"{API}/environments/{{env}}"
+V = f"{E}/versions/{{v}}"
+STATUS = {"environment": "{env}", "channel": "latest", "version": 1, "root": "0" * 64, "state": "active"}
+STATE = {"maps": [{"mapId": "{env}", "mapVersion": "1", "mapStatus": "ENABLED"}]}
+NAMED = "environment={env}"
+ROWS = [
+    *rows("open", open="GET /, GET /openapi.json, GET /docs, GET /docs/{name}, GET /healthz, GET /readyz"),
+    *rows("server", viewer="GET /metrics", admin=f"GET {API}/tokens, DELETE {API}/tokens/{{id}}, POST {API}/keys"),
+    Row(f"POST {API}/tokens", "admin", "server", {"name": "x", "role": "viewer", "environments": OTHERS}),
+    *rows("filtered", viewer=f"GET {API}/formats, GET {API}/derivations, GET {API}/generators, GET {API}/templates"),
+    *rows("filtered", viewer=f"GET {API}/keys, GET {API}/environments, GET {API}/robots, GET {API}/robots/{{robot}}"),
+    Row(f"GET {API}/events", "viewer", "filtered", query="since=0&follow=false"),
+    Row(f"POST {API}/convert", "editor", "filtered"),
+    Row(f"POST {API}/robots/{{robot}}/vda5050/state", "robot", "filtered", STATE, own_robot=True),
+    Row(f"GET {API}/events", "viewer", "environment", query=f"{NAMED}&since=0&follow=false"),
+    Row(f"GET {API}/robots", "viewer", "environment", query=NAMED),
+    Row(f"GET {API}/robots/{{robot}}", "viewer", "environment", query=NAMED),
+    Row(f"DELETE {API}/robots/{{robot}}", "editor", "environment", query=NAMED),
+    Row(f"PUT {API}/robots/{{robot}}/status", "robot", "environment", STATUS, own_robot=True),
+    Row(f"POST {API}/environments", "admin", "environment", {"name": "{env}"}, creates=True),
+    Row(f"POST {API}/environments", "admin", "environment", {"name": "street-2", "clone": {"environment": "{env}"}}),
+    Row(f"GET {API}/jobs/{{job}}", "admin", "job"),
+    Row(f"DELETE {API}/jobs/{{job}}", "admin", "job"),
+    Row(f"PATCH {E}", "editor", "environment", {"datum": {"latitude": 53.2, "longitude": -0.5}}),
+    Row(f"PATCH {E}", "admin", "environment", {"title": "x"}),
+    *rows(
+        "environment",
+        viewer=f"GET {E}, GET {E}/versions, GET {V}, GET {V}/sources, GET {V}/sources/{{name}}, GET {V}/layers, "
+        f"GET {V}/layers/{{layer}}, GET {V}/maps, GET {V}/reports/{{format}}, POST {V}/links, GET {E}/diff, "
+        f"GET {V}/delta, GET {E}/channels, GET {E}/transform, GET {E}/templates, GET {E}/templates/{{format}}, "
+        f"GET {V}/manifest, GET {V}/provenance, GET {E}/overlays, GET {E}/overlays/nav2, GET {E}/overlays/rmf, "
+        f"GET {E}/overlays/vda5050, GET {V}/vda5050/actions, GET {V}/maps/{{format}}, "
+        f"GET {V}/maps/{{format}}/{{file}}, GET /maps/{{env}}/{{format}}, GET /maps/{{env}}/{{format}}/{{file}}",
+        robot=f"POST {E}/overlays",
+        editor=f"POST {E}/versions, POST {E}/edits, PUT {E}/channels/{{channel}}, "
+        f"DELETE {E}/channels/{{channel}}/planned, POST {E}/derivations, POST {E}/generations, PUT {E}/templates, "
+        f"DELETE {E}/templates, PUT {E}/templates/{{format}}, DELETE {E}/templates/{{format}}, POST {E}/alignments, "
+        f"POST {E}/overlays/{{id}}/accept, POST {E}/overlays/{{id}}/reject, POST {E}/overlays/{{id}}/end, "
+        f"POST {E}/overlays/{{id}}/keep",
+        admin=f"DELETE {E}, POST {E}/restore, POST {E}/purge",
+    ),
+]
+
+NO_TOKEN = ("none", "garbage", "expired", "revoked")
+LIMITED = " elsewhere"
+VALUES = {"v": "1", "format": "tmap2", "file": "network.tmap2.yaml", "name": "n.tmap2.yaml", "layer": "topology",
+          "channel": "staging", "id": "nosuch", "robot": "r1"}  # fmt: skip
+
+
+@dataclass
+class Site:
+    """A server, and an Authorization header for every kind of caller."""
+
+    api: Api
+    bearer: dict[str, str]
+
+    def send(self, row: Row, caller: str, env: str, method: str | None = None) -> httpx.Response:
+        job = ""
+        if "{job}" in row.request:
+            job = self.api.app.state.services.store.create_job("another token").id
+        known, path = row.request.split(" ")
+        values = {**VALUES, "env": env, "job": job}
+        path = re.sub(r"\{(\w+)\}", lambda found: values[found[1]], path)
+        query = f"?{row.query.replace('{env}', env)}" if row.query else ""
+        content = None if row.body is None else json.dumps(row.body).replace("{env}", env)
+        headers = {"content-type": "application/json"} if content else {}
+        if caller in self.bearer:
+            headers["authorization"] = f"Bearer {self.bearer[caller]}"
+        answer = self.api.as_nobody.request(method or known, path + query, content=content, headers=headers)
+        self.text = answer.text.replace(env, "{env}")
+        return answer
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    with running(settings_for(tmp_path_factory.mktemp("matrix"), token_failures=10_000)) as api:
+        api.post("environments", {"name": FARM})
+        api.upload(FARM, {"n.tmap2.yaml": samples.tmap2()})
+        store = api.app.state.services.store
+        past = datetime.now(UTC) - timedelta(seconds=1)
+        bearer = {"garbage": "x" * 43, "expired": store.create_token("expired", "admin", expires=past)[1]}
+        for pattern, suffix in ((None, ""), (OTHERS, LIMITED)):
+            for name, robot in (("viewer", None), ("robot", "r1"), ("robot", "r2"), ("editor", None), ("admin", None)):
+                caller = f"{name} {robot}" if robot else name
+                bearer[caller + suffix] = store.create_token(caller, name, pattern, robot)[1]
+        revoked, bearer["revoked"] = store.create_token("revoked", "admin")
+        api.get("formats", headers={"Authorization": f"Bearer {bearer['revoked']}"})
+        api("DELETE", f"tokens/{revoked.id}", 204)
+        api.as_nobody = api.as_(None).http  # type: ignore[attr-defined]
+        yield Site(api, bearer)
+
+
+def expected(row: Row, caller: str) -> int | None:
+    """The status for a caller; None for any but 401 and 403."""
+    if row.role is None:
+        return None
+    if caller in NO_TOKEN:
+        return 401
+    limited = caller.endswith(LIMITED)
+    name = caller.removesuffix(LIMITED)
+    if row.scope == "job":
+        return None if name == "admin" and not limited else 404
+    if name.split(" ")[0] not in INCLUDES[row.role] or (row.own_robot and name == "robot r2"):
+        return 403
+    return 403 if limited and row.scope in ("environment", "server") else None
+
+
+def hidden(routes: list[Any]) -> Iterator[str]:
+    """Paths of routes, also of included routers, that OpenAPI leaves out."""
+    for route in routes:
+        if hasattr(route, "original_router"):
+            yield from hidden(route.original_router.routes)
+        elif not route.include_in_schema:
+            yield route.path
+
+
+def test_every_route_has_a_row(site: Site) -> None:
+    app = site.api.app
+    found = {
+        f"{method.upper()} {path}"
+        for path, operations in app.openapi()["paths"].items()
+        for method in operations
+        if method != "parameters"
+    }
+    for route in app.routes:
+        if isinstance(route, Route):
+            found |= {f"{m} {route.path.replace(':path', '')}" for m in (route.methods or ()) if m != "HEAD"}
+        else:
+            assert not list(hidden(route.original_router.routes)), "not in OpenAPI, so not in this table"
+    assert {row.request.replace("{job}", "{id}") for row in ROWS} == found
+
+
+def test_each_route_answers_each_caller_as_the_table_says(site: Site) -> None:
+    wrong = []
+    for row in ROWS:
+        for caller in ("none", *site.bearer):
+            env = FARM if row.creates else ABSENT
+            status = site.send(row, caller, env).status_code
+            want = expected(row, caller)
+            if status >= 500 or (status in (401, 403) if want is None else status != want):
+                wrong.append(f"{row.request} {row.query} {row.body}, {caller}: {status}, not {want}")
+        if row.request.startswith("GET "):
+            head = site.send(row, "none", FARM, "HEAD").status_code
+            if head != 401 and row.role is not None:
+                wrong.append(f"HEAD {row.request}: {head}")
+    assert wrong == []
+
+
+def test_answers_do_not_tell_whether_a_foreign_environment_exists(site: Site) -> None:
+    """A limited token gets the same answer for one that exists and for one that does not."""
+    site.api("PUT", "robots/r1/status", 200, json={**STATUS, "environment": FARM})
+    differ = []
+    for row in ROWS:
+        if "{env}" not in f"{row.request} {row.query} {row.body}":
+            continue
+        for caller in site.bearer:
+            if caller.endswith(LIMITED):
+                answers = [(site.send(row, caller, env).status_code, site.text) for env in (FARM, ABSENT)]
+                if answers[0] != answers[1]:
+                    differ.append(f"{row.request} {row.query}, {caller}: {answers}")
+    assert differ == []
+    header = {"Authorization": f"Bearer {site.bearer['viewer' + LIMITED]}"}
+    nobody: httpx.Client = site.api.as_nobody  # type: ignore[attr-defined]
+    for path in ("environments", "robots"):
+        assert nobody.get(f"{API}/{path}", headers=header).json() == []
+    assert "farm" not in nobody.get(f"{API}/events?since=0&follow=false", headers=header).text
+    seen, unseen = (nobody.get(f"{API}/robots/{robot}", headers=header) for robot in ("r1", "r9"))
+    assert (seen.status_code, seen.text.replace("r1", "r9")) == (unseen.status_code, unseen.text)
+
+
+def test_foreign_jobs_are_not_found(site: Site) -> None:
+    store = site.api.app.state.services.store
+    nobody: httpx.Client = site.api.as_nobody  # type: ignore[attr-defined]
+    job = store.create_job("another token").id
+    for caller in ("viewer", "editor", "admin" + LIMITED):
+        header = {"Authorization": f"Bearer {site.bearer[caller]}"}
+        found, absent = (nobody.get(f"{API}/jobs/{number}", headers=header) for number in (job, "0" * 32))
+        assert (found.status_code, found.text.replace(job, "0" * 32)) == (absent.status_code, absent.text) != (200, "")
+    assert store.job(job)
+
+
+def test_unknown_addresses_need_a_token_as_well(site: Site) -> None:
+    for path in ("/nothing", "/api/v1/nothing", "/docsx", "/healthz/", "/maps"):
+        site.api.as_(None).problem("GET", path, 401)
+        site.api.problem("GET", path, 404)
