@@ -15,8 +15,6 @@ from app.cli.history import change_line, channel_rows
 from app.errors import Invalid, NotFound
 from app.model.frame import GROUND, Datum
 
-LAYERS = ("location", "objects", "topology", "occupancy", "voxels", "imagery", "zones")
-
 
 def import_maps(
     paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="An environment's folder, or map files.")],
@@ -165,7 +163,7 @@ def convert(
     """
     local.require_server_python("convert")
     from app import formats, parameters
-    from app.bundle import Hints
+    from app.bundle import Hints, drawn_layer
     from app.convert import offline
     from app.derive import all_derivations, takes
 
@@ -176,7 +174,7 @@ def convert(
     ours |= {name for step in all_derivations() for name in takes(step)}
     values = options.pairs(option)
     files, _, notes = _collect(paths)
-    hints = Hints(format, _layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})
+    hints = Hints(format, drawn_layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})
     wanted = {k: v for k, v in values.items() if k in ours}
     with output.progress_bar(f"converting to {to}"):
         data = {f.name: f.path.read_bytes() for f in files}
@@ -431,9 +429,3 @@ def _step(step: Any) -> str:
         return name
     start = step["from"] if isinstance(step["from"], str) else " and ".join(step["from"])
     return f"{start} to {step['to']} ({name})"
-
-
-def _layer(text: str | None) -> Any:
-    if text is not None and text not in LAYERS:
-        raise Invalid(f"--layer must be objects, topology, location or zones, got {text!r}")
-    return text
