@@ -5,18 +5,22 @@ Exit status: 0 it worked, 1 it did not (the reason stands on standard error), 2 
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from app import __version__
-from app.cli import agent, align, generate, history, maps, output, position, serving, templates, tokens
-from app.cli.client import Refused
+from app.cli import groups
+from app.cli.problems import Refused, problem_of
 from app.errors import FleetMapError
+
+if TYPE_CHECKING:
+    from typer._click import Context
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -25,55 +29,118 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sys.exit(run(given))
 
 
-HINTS: Mapping[str, str] = {
-    "MissingDatum": "On the command line: --datum LAT,LON, or a datum.yaml among the files.",
-    "missing-datum": "On the command line: `fleetmap import PATH --environment NAME --datum LAT,LON`.",
-    "Ambiguous": "On the command line: --option grid=NAME.",
-    "ambiguous": "On the command line: --option grid=NAME.",
-}
-"""What to do here, by our own errors' class or the last word of a server's problem type."""
-
-
 def run(arguments: Sequence[str]) -> int:
-    """One command: its exit status. Errors are printed to standard error, as JSON with ``--json``."""
-    as_json = "--json" in arguments
-    completing = "_FLEETMAP_COMPLETE" in os.environ and find_spec("pydantic_settings") is not None
+    """Run one command and return its exit status. Errors are printed to standard error, as JSON with ``--json``."""
     try:
-        command = build(all_flags=completing or list(arguments[:1]) == ["serve"])
-        command(list(arguments), prog_name="fleetmap", standalone_mode=True)
+        build(needed(arguments))(list(arguments), prog_name="fleetmap", standalone_mode=True)
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else int(error.code is not None)
-    except Refused as refused:
-        kind = str(refused.problem.get("type", "")).rpartition(":")[2]
-        output.show_problem(refused.problem, hint=refused.hint or HINTS.get(kind, ""), as_json=as_json)
-        return 1
-    except FleetMapError as error:
-        output.show_problem(as_problem(error), hint=HINTS.get(type(error).__name__, ""), as_json=as_json)
-        return 1
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition(".")[0] == "app":
+    except (Refused, FleetMapError, ModuleNotFoundError, OSError) as error:
+        problem, hint = problem_of(error)
+        if problem is None:
             raise
-        detail = f"this command needs the server's packages ({error.name} is not installed)"
-        hint = 'pip install "fleet-map-server[server]"'
-        output.show_problem({"title": "Not installed", "detail": detail}, hint=hint, as_json=as_json)
-        return 1
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        output.show_problem(
-            {"title": "Input or output failed", "detail": f"{where}{error.strerror or error}"}, as_json=as_json
-        )
+        from app.cli import output
+
+        output.show_problem(problem, hint=hint, as_json="--json" in arguments)
         return 1
     return 0
 
 
-def build(*, all_flags: bool = True) -> typer.Typer:
-    """All commands. ``all_flags``: whether ``serve`` needs an option for every setting, which costs imports."""
-    app = typer.Typer(
+def needed(arguments: Sequence[str]) -> str | None:
+    """Return the only command that a call needs: the fewer are imported, the sooner it starts. None: all of them."""
+    if "_FLEETMAP_COMPLETE" not in os.environ:
+        return "" if list(arguments) == ["--version"] else groups.first_command(arguments)
+    typed = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS") or ""
+    words = [*typed.split(), *[""][: typed.endswith(" ")]]
+    only = groups.first_command(words[1:-1])
+    return only if only != "serve" or find_spec("pydantic_settings") is not None else None
+
+
+PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
+    "Maps": (
+        ("import", "maps:import_maps"),
+        ("export", "maps:export_map"),
+        ("coverage", "maps:coverage"),
+        ("link", "maps:link"),
+        ("template", "templates:template"),
+    ),
+    "Files on this machine (no server needed)": (
+        ("convert", "maps:convert"),
+        ("check", "maps:check"),
+        ("formats", "maps:list_formats"),
+    ),
+    "Environments and their versions": (
+        ("environment", "environments:commands"),
+        ("versions", "history:versions"),
+        ("diff", "history:diff"),
+        ("revert", "history:revert"),
+        ("where", "position:locate"),
+        ("derive", "history:derive"),
+        ("align", "align:align"),
+        ("generate", "generate:generate"),
+    ),
+    "Fleet": (
+        ("promote", "history:promote"),
+        ("channels", "channels:commands"),
+        ("robots", "robots:commands"),
+        ("overlays", "overlays:commands"),
+        ("events", "events:events"),
+        ("agent", "agent:agent"),
+        ("agent-level", "agent:agent_level"),
+    ),
+    "Server": (
+        ("serve", "serving:serve"),
+        ("demo", "serving:demo"),
+        ("token", "tokens:commands"),
+        ("keys", "keys:commands"),
+        ("jobs", "jobs:commands"),
+        ("migrate", "serving:migrate"),
+    ),
+}
+"""Commands in the order of the help: name, and where its function or group is (below ``app.cli``)."""
+
+ALIASES: Mapping[str, str] = {
+    "environments": "environment",
+    "channel": "channels",
+    "robot": "robots",
+    "overlay": "overlays",
+    "event": "events",
+    "tokens": "token",
+    "key": "keys",
+    "job": "jobs",
+    "format": "formats",
+    "version": "versions",
+}
+"""Further names of commands; the help does not list them."""
+
+NEGATIVE_ARGUMENTS = frozenset({"where"})
+"""Commands whose argument may start with a minus: a southern latitude is no option."""
+
+
+class Root(groups.Group):
+    """All commands, in the order of the panels."""
+
+    def list_commands(self, ctx: Context) -> list[str]:
+        """Return the names as the help lists them."""
+        order = [name for commands in PANELS.values() for name, _ in commands]
+        return sorted(super().list_commands(ctx), key=lambda name: order.index(ALIASES.get(name, name)))
+
+
+def build(only: str | None = None) -> typer.Typer:
+    """Build the commands.
+
+    Args:
+        only: the command that is needed: others are neither imported nor built. All of them for None and for a name
+            that is no command's, none for an empty text. Only where it is named does ``serve`` get an option for every
+            setting, since these import the server's settings.
+    """
+    app = groups.Commands(
+        "Store versioned maps of every environment, and give each robot the map in its own format.",
+        cls=Root,
         no_args_is_help=True,
         add_completion=True,
         pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-        help="Versioned maps of every environment, for every robot in its own format.",
+        epilog="New here? `fleetmap serve --demo`. A command's options and an example: `fleetmap COMMAND --help`.",
     )
 
     @app.callback()
@@ -82,43 +149,26 @@ def build(*, all_flags: bool = True) -> typer.Typer:
             bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
         ] = False,
     ) -> None:
-        """Versioned maps of every environment, for every robot in its own format."""
+        pass
 
-    app.command("serve")(serving.with_flags(serving.serve) if all_flags else _serve_without_flags)
-    for name, function in (
-        ("import", maps.import_maps),
-        ("export", maps.export_map),
-        ("link", maps.link),
-        ("convert", maps.convert),
-        ("check", maps.check),
-        ("formats", maps.list_formats),
-        ("coverage", maps.coverage),
-        ("versions", history.versions),
-        ("diff", history.diff),
-        ("promote", history.promote),
-        ("revert", history.revert),
-        ("derive", history.derive),
-        ("align", align.align),
-        ("generate", generate.generate),
-        ("template", templates.template),
-        ("agent", agent.agent),
-        ("agent-level", agent.agent_level),
-        ("migrate", serving.migrate),
-        ("demo", serving.demo),
-    ):
-        app.command(name)(function)
-    # A southern latitude starts with a minus, and is no option.
-    app.command("where", context_settings={"ignore_unknown_options": True})(position.locate)
-    app.add_typer(tokens.commands, name="token")
+    panels = {name: panel for panel, commands in PANELS.items() for name, _ in commands}
+    places = {name: place for commands in PANELS.values() for name, place in commands}
+    if only is not None and only in ALIASES:
+        places = {only: places[ALIASES[only]]}
+    elif only is not None:
+        places = {only: places[only]} if only in places else places if only else {}
+    for name, place in places.items():
+        module, _, member = place.partition(":")
+        found = getattr(importlib.import_module(f"app.cli.{module}"), member)
+        shown: dict[str, Any] = {"rich_help_panel": panels.get(name), "hidden": name in ALIASES}
+        if isinstance(found, typer.Typer):
+            app.add_typer(found, name=name, **shown)
+            continue
+        if name == "serve":
+            found = sys.modules["app.cli.serving"].with_flags(found) if only == "serve" else _serve_without_flags
+        settings = {"ignore_unknown_options": True} if name in NEGATIVE_ARGUMENTS else None
+        app.command(name, context_settings=settings, **shown)(found)
     return app
-
-
-def as_problem(error: FleetMapError) -> dict[str, Any]:
-    """An error of our own as the server would tell it."""
-    problem: dict[str, Any] = {"title": type(error).__name__, "detail": error.detail}
-    if error.problems:
-        problem["errors"] = [p.as_dict() for p in error.problems]
-    return problem
 
 
 def _serve_without_flags() -> None:
@@ -127,5 +177,5 @@ def _serve_without_flags() -> None:
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        output.show(f"fleetmap {__version__}")
+        sys.stdout.write(f"fleetmap {__version__}\n")
         raise typer.Exit

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli import local, options, output, write
-from app.cli.client import Client, Refused, path_of
+from app.cli.client import Client, path_of
+from app.cli.created import ensured
 from app.cli.folder import check_name, environment_name
 from app.cli.history import show_made
 from app.cli.maps import show_report
@@ -32,6 +33,7 @@ def generate(
         str | None, typer.Option("--to", help="Write a map in this format instead; needs no server, keeps nothing.")
     ] = None,
     out: options.Output = None,
+    create: options.Create = None,
     message: options.Message = "",
     replace: options.Replace = False,
     server: options.Server = None,
@@ -53,8 +55,11 @@ def generate(
         name = environment or environment_name(f"{site}-{seed}")
         check_name(name)
         body = {"generator": site, "seed": seed, "parameters": values, "message": message, "replace": replace}
-        with Client(server, token) as client, output.progress_bar(f"generating {site}"):
-            _ensure(client, name, place)
+        with (
+            Client(server, token) as client,
+            output.progress_bar(f"generating {site}"),
+            ensured(client, name, datum=place, create=create if environment else True),
+        ):
             made = client.post(path_of("environments", name, "generations"), body, repeat=True)
         show_made(name, made, as_json=as_json)
         return
@@ -88,19 +93,6 @@ def _list(*, as_json: bool) -> None:
             for one in known
         ],
     )
-
-
-def _ensure(client: Client, name: str, datum: Datum | None) -> None:
-    """Make sure that the environment is there and has the datum that was asked for."""
-    try:
-        known = client.get(path_of("environments", name))
-    except Refused as refused:
-        if refused.status != 404:
-            raise
-        client.post("/environments", {"name": name, "datum": datum.as_dict() if datum else None})
-        return
-    if datum is not None and (known.get("datum") or {}) != datum.as_dict():
-        client.patch(path_of("environments", name), {"datum": datum.as_dict()})
 
 
 def _write(

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli import local, options, output
-from app.cli.client import Client, Refused, path_of
-
-Environment = Annotated[str, typer.Argument(help="Name of the environment.")]
+from app.cli import completion, local, options, output
+from app.cli.client import Client, path_of
+from app.cli.environments import list_environments
+from app.cli.problems import Refused
 
 
 def versions(
@@ -26,7 +26,7 @@ def versions(
     The newest version comes first; each is told with the channels that stand on it.
     """
     if environment is None:
-        _environments(limit, server, token, as_json=as_json)
+        list_environments(limit=limit, server=server, token=token, as_json=as_json)
         return
     with Client(server, token) as client:
         page = {"limit": min(limit, 100)}
@@ -41,7 +41,7 @@ def versions(
             (
                 row["version"],
                 ", ".join(standing.get(row["version"], ())),
-                _minute(row.get("time")),
+                output.minute(row.get("time")),
                 row.get("author"),
                 row.get("message"),
                 summary(row.get("changes") or {}),
@@ -52,31 +52,48 @@ def versions(
 
 
 def diff(
-    environment: Environment,
-    old: Annotated[str, typer.Argument(metavar="FROM", help="Version number or channel.")],
-    new: Annotated[str, typer.Argument(metavar="TO", help="Version number or channel.")] = "latest",
+    environment: options.Environment,
+    old: Annotated[
+        str, typer.Argument(metavar="FROM", help="Version number or channel.", autocompletion=completion.versions)
+    ],
+    new: Annotated[
+        str, typer.Argument(metavar="TO", help="Version number or channel.", autocompletion=completion.versions)
+    ] = "latest",
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """What differs between two versions, item by item."""
+    """Show what differs between two versions: a summary, then item by item (+ added, ~ changed, - deleted).
+
+    Example: `fleetmap diff farm production latest`
+    """
     with Client(server, token) as client:
         told = client.get(path_of("environments", environment, "diff"), {"from": old, "to": new})
     if as_json:
         output.show_json(told)
         return
-    layers = told.get("layers") or {}
-    lines = 0
-    for layer, change in layers.items():
-        for line in _lines(layer, change):
-            output.show(line)
-            lines += 1
+    old, new = str(told.get("from", old)), str(told.get("to", new))
+    lines = [line for layer, change in (told.get("layers") or {}).items() for line in _lines(layer, change)]
     if not lines:
-        output.show(f"versions {told.get('from', old)} and {told.get('to', new)} hold the same")
+        output.show(f"versions {old} and {new} have the same content")
+        return
+    parts = filter(None, (_summary(layer, change) for layer, change in told["layers"].items()))
+    output.show(f"versions {old} → {new}: {'; '.join(parts)}")
+    for line in lines:
+        output.show(line)
+
+
+def _summary(layer: str, change: Mapping[str, Any]) -> str:
+    """Summarise a layer's differences: ``topology 2 added, 1 deleted``, ``occupancy map (30 freed)``."""
+    if layer in ("datum", "templates"):
+        return f"{layer} changed"
+    if any(isinstance(change.get(kind), list) for kind in ("added", "changed", "deleted")):
+        return f"{layer} {counts({kind: len(change.get(kind) or ()) for kind in ('added', 'changed', 'deleted')})}"
+    return f"{layer} {counts(change)}" if any(change.values()) else ""
 
 
 def promote(
-    environment: Environment,
+    environment: options.Environment,
     version: Annotated[
         str, typer.Argument(help="Version number or channel that the channel is to stand on.")
     ] = "latest",
@@ -134,7 +151,7 @@ def promote(
 
 
 def revert(
-    environment: Environment,
+    environment: options.Environment,
     version: Annotated[str, typer.Argument(help="Version number or channel whose content is wanted back.")],
     message: options.Message = "",
     server: options.Server = None,
@@ -185,7 +202,7 @@ def summary(changes: Mapping[str, Any]) -> str:
 def change_line(what: str, change: Any) -> str:
     """What changed and how: ``topology: 2 added``, ``datum: none → 53.25, -0.5``."""
     if what == "datum" and isinstance(change, Mapping):
-        return f"datum: {_datum(change.get('from'))} → {_datum(change.get('to'))}"
+        return f"datum: {output.datum(change.get('from'))} → {output.datum(change.get('to'))}"
     if what == "templates" and isinstance(change, Mapping):
         return f"templates: {', '.join(_template_changes(change))}"
     if what == "renewed" and isinstance(change, list):
@@ -241,19 +258,6 @@ def _template_changes(change: Mapping[str, Any]) -> list[str]:
     return out
 
 
-def _environments(limit: int, server: str | None, token: str | None, *, as_json: bool) -> None:
-    """All environments that the token may see, by name."""
-    with Client(server, token) as client:
-        rows = list(client.pages("/environments", {"limit": min(limit, 100)}, limit=limit))
-    if as_json:
-        output.show_json(rows)
-        return
-    output.show_table(
-        ("environment", "version", "changed (UTC)", "title"),
-        ((row["name"], row["version"], _minute(row.get("updated")), row.get("title")) for row in rows),
-    )
-
-
 def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
     """What the named server can compute, or where none is named, or none answers, what any can."""
     named = server or os.environ.get("FLEETMAP_SERVER")
@@ -273,18 +277,6 @@ def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
 
     output.say(f"{why}: a server with a provider of pictures has location_to_imagery, too")
     return [as_dict(d) for d in all_derivations().values()]
-
-
-def _minute(time: Any) -> str:
-    """RFC 3339 as the API tells it (UTC), to the minute: ``2026-05-01 08:30``."""
-    return str(time or "")[:16].replace("T", " ")
-
-
-def _datum(datum: Any) -> str:
-    if not isinstance(datum, Mapping):
-        return "none"
-    heading = datum.get("heading")
-    return f"{datum.get('latitude')}, {datum.get('longitude')}{f', heading {heading:g}°' if heading else ''}"
 
 
 def derive(

@@ -8,8 +8,9 @@ import typer
 
 from app.cli import options, output
 from app.cli.client import Client, path_of
+from app.cli.groups import Commands
 
-commands = typer.Typer(no_args_is_help=True, help="Create, list and delete access tokens (as administrator).")
+commands = Commands("Create, list and delete access tokens (as administrator).")
 
 
 @commands.command("create")

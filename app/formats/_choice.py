@@ -40,9 +40,9 @@ def the_one(
     found = [key for key in every if level in (None, key.level)]
     names = sorted({key.name for key in found})
     if not found:
-        levels = sorted({key.level for key in every})
-        near = did_you_mean(level or "", levels)
-        raise NotFound(f"there is no {what} on the level {level!r}{near}; there are {what}s on: {', '.join(levels)}")
+        there = sorted({key.level for key in every})
+        near = did_you_mean(level or "", there)
+        raise NotFound(f"there is no {what} on the level {level!r}{near}; there are {what}s on: {', '.join(there)}")
     name = name or (usual if usual in names else names[0] if len(names) == 1 else None)
     if name is None:
         raise Ambiguous(f"there are several {what}s, name one with {option}=…: {', '.join(names)}")

@@ -67,9 +67,10 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, wish: Ali
     entries = {e.key: e for e in base.parts}
     if key not in entries:
         stored = [f"{k.level}/{k.name}" for k in sorted(entries) if k.layer == "occupancy"]
-        wanted = f"{wish.level}/{wish.grid}"
-        near = did_you_mean(wanted, stored)
-        raise NotFound(f"there is no grid {wanted}{near}; stored grids: {', '.join(stored) or 'none'}")
+        name = f"{wish.level}/{wish.grid}"
+        raise NotFound(
+            f"there is no grid {name}{did_you_mean(name, stored)}; stored grids: {', '.join(stored) or 'none'}"
+        )
     if not wish.pairs and wish.layer == "occupancy" and key == target:
         reason = "a grid lies on itself already: name another one, a layer (objects, voxels), or pairs of points"
         raise Invalid(reason, [Problem(reason, where="body.onto")])

@@ -11,11 +11,10 @@ from sqlalchemy import Connection, Row, func, insert, select, update
 
 from app.errors import Conflict, Invalid, NotFound, Problem, StaleParent, Unavailable
 from app.model.frame import Datum, Level
-from app.model.names import did_you_mean
 from app.model.templates import Templates, template_changes
 from app.store import chunks, index, outbox, tables
 from app.store.area import area_after, put_area
-from app.store.base import Base, clean, clean_problem, environment_row, text, utcnow
+from app.store.base import Base, clean, clean_problem, environment_row, nearest_channel, text, utcnow
 from app.store.changes import KEEP, Changes, Keep, Prepared
 from app.store.extent import extent, geometry
 from app.store.manifest import as_version, pack_manifest, read_sources, read_version
@@ -38,8 +37,7 @@ def resolve(connection: Connection, environment: Row[Any], ref: str | int) -> in
     query = select(table.c.version).where(table.c.environment_id == environment.id, table.c.name == ref)
     found = connection.execute(query).scalar_one_or_none()
     if found is None:
-        names = connection.execute(select(table.c.name).where(table.c.environment_id == environment.id)).scalars()
-        near = did_you_mean(ref, [LATEST, *names])
+        near = nearest_channel(connection, environment, ref)
         raise NotFound(
             f"{environment.name} has no version or channel {ref[:80]!r}{near}: ask for a number, latest, or a channel "
             "that was set"

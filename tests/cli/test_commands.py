@@ -80,7 +80,7 @@ def test_versions_diff_promote_and_revert(fleetmap: Fleetmap, network: Path, tmp
     assert fleetmap("revert", "story", "production").status == 0
     roots = {row["version"]: row["root"] for row in fleetmap("versions", "story", "--json").json}
     assert roots[3] == roots[1] != roots[2]
-    assert "hold the same" in fleetmap("diff", "story", "1", "3").out
+    assert "have the same content" in fleetmap("diff", "story", "1", "3").out
     assert len(fleetmap("versions", "story", "-n", "2", "--json").json) == 2
 
 
@@ -204,7 +204,8 @@ def test_a_damaged_file_is_refused_with_its_place(fleetmap: Fleetmap, tmp_path: 
     problem = json.loads(fleetmap("import", bad, "-e", "damaged", "-f", "tmap2", "--json").err)
     assert problem["status"] == 422
     assert problem["errors"][0]["file"] == "bad.tmap2.yaml"
-    assert all(row["version"] == 0 for row in fleetmap("versions", "damaged", "--json").json)
+    assert "no environment" in fleetmap("environment", "show", "damaged").err, "nothing is left behind"
+    assert fleetmap("import", bad.with_name("network.tmap2.yaml"), "-e", "damaged").status == 1
 
 
 def test_the_same_problem_without_a_server(offline: Fleetmap, tmp_path: Path) -> None:
