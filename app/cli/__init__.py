@@ -172,7 +172,7 @@ def build(only: str | None = None) -> typer.Typer:
 
 
 def _serve_without_flags() -> None:
-    """Start the server."""
+    """Start the server, with a demo if you like."""
 
 
 def _show_version(wanted: bool) -> None:

@@ -15,15 +15,22 @@ from app.cli.problems import Refused
 
 
 def versions(
-    environment: Annotated[str | None, typer.Argument(help="Name of the environment [default: list them all].")] = None,
-    limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="How many, newest first.")] = 20,
+    environment: Annotated[
+        str | None,
+        typer.Argument(
+            help="Name of the environment [default: list all environments].", autocompletion=completion.environments
+        ),
+    ] = None,
+    limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="Maximum number, newest first.")] = 20,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """An environment's history; without a name, all environments.
+    """List the versions of an environment, newest first, with the channels that point to each.
 
-    The newest version comes first; each is told with the channels that stand on it.
+    Without a name it lists all environments, as `environment list` does.
+
+    Example: `fleetmap versions farm`
     """
     if environment is None:
         list_environments(limit=limit, server=server, token=token, as_json=as_json)
@@ -95,34 +102,51 @@ def _summary(layer: str, change: Mapping[str, Any]) -> str:
 def promote(
     environment: options.Environment,
     version: Annotated[
-        str, typer.Argument(help="Version number or channel that the channel is to stand on.")
+        str,
+        typer.Argument(
+            help="Version number or channel that the channel is to point to.", autocompletion=completion.versions
+        ),
     ] = "latest",
-    channel: Annotated[str, typer.Option("--channel", "-c", help="The channel to move.")] = "production",
-    at: Annotated[str | None, typer.Option("--at", metavar="TIME", help="Activate then (RFC 3339), not now.")] = None,
+    channel: Annotated[
+        str, typer.Option("--channel", "-c", help="Channel to move.", autocompletion=completion.channels)
+    ] = "production",
+    at: Annotated[
+        str | None,
+        typer.Option("--at", metavar="TIME", help="Move at this time (RFC 3339: 2030-01-31T06:00:00Z), not now."),
+    ] = None,
     ready: Annotated[
         float | None,
-        typer.Option("--ready", metavar="SHARE", help="Move when this share of its online robots has it (0.9)."),
+        typer.Option(
+            "--ready", metavar="SHARE", help="Move when this share of its online robots has the version (0.9)."
+        ),
     ] = None,
     failed: Annotated[
         float | None,
         typer.Option(
-            "--failed", metavar="SHARE", help="Move back, or do not move, when this share of its robots fails (0.2)."
+            "--failed", metavar="SHARE", help="Do not move, or move back, if this share of its robots fails (0.2)."
         ),
     ] = None,
     deadline: Annotated[
         str | None,
-        typer.Option("--deadline", metavar="TIME", help="Without enough robots it stays then (needs --ready)."),
+        typer.Option(
+            "--deadline", metavar="TIME", help="Give up at this time if too few robots are ready (needs --ready)."
+        ),
     ] = None,
     window: Annotated[
         float | None,
-        typer.Option("--window", metavar="SECONDS", help="How long robots are watched after the move [default: 600]."),
+        typer.Option("--window", metavar="SECONDS", help="Watch robots for this long after the move [default: 600]."),
     ] = None,
-    cancel: Annotated[bool, typer.Option("--cancel", help="Drop what is planned for the channel.")] = False,
+    cancel: Annotated[bool, typer.Option("--cancel", help="Cancel the planned move of the channel.")] = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Move a channel to a version: roll out, in two stages where you say so, or roll back."""
+    """Move a channel to a version: its robots fetch that map. An older version rolls back.
+
+    With --ready or --failed it moves in two stages: robots fetch the version first and are watched afterwards.
+
+    Example: `fleetmap promote farm 12 --ready 0.9 --failed 0.2`
+    """
     stages = {"ready": ready, "failed": failed, "deadline": deadline, "window": window}
     rollout = {name: value for name, value in stages.items() if value is not None}
     with Client(server, token) as client:
@@ -143,24 +167,29 @@ def promote(
     elif moved["planned"] is None:
         watched = (moved["rollout"] or {}).get("state") == "watching"
         more = ", and moves back where too many robots fail" if watched else ""
-        output.show(f"{environment}: {channel} stands on version {number}{more}")
+        output.show(f"{environment}: {channel} points to version {number}{more}")
     else:
         when = [f"{ready:.4g} of its online robots have it"] if ready is not None else []
         when += [f"it is {at}"] if at else []
-        output.show(f"{environment}: {channel} will stand on version {number} when {' and '.join(when)}")
+        output.show(f"{environment}: {channel} will point to version {number} when {' and '.join(when)}")
 
 
 def revert(
     environment: options.Environment,
-    version: Annotated[str, typer.Argument(help="Version number or channel whose content is wanted back.")],
+    version: Annotated[
+        str,
+        typer.Argument(
+            help="Version number or channel with the content to return to.", autocompletion=completion.versions
+        ),
+    ],
     message: options.Message = "",
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Make a new version with an old one's content.
+    """Create a new version with the content of an old one. Nothing is deleted.
 
-    Nothing is deleted.
+    Example: `fleetmap revert farm 11 -m 'the survey was wrong'`
     """
     with Client(server, token) as client:
         number = resolve(client, environment, version)
@@ -275,13 +304,21 @@ def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
     from app.api.derivations import as_dict
     from app.derive import all_derivations
 
-    output.say(f"{why}: a server with a provider of pictures has location_to_imagery, too")
+    output.say(f"{why}: a server with a provider of satellite pictures also has location_to_imagery")
     return [as_dict(d) for d in all_derivations().values()]
 
 
 def derive(
-    environment: Annotated[str | None, typer.Argument(help="Name of the environment [default: list methods].")] = None,
-    method: Annotated[str | None, typer.Argument(help="The derivation, such as occupancy_to_topology.")] = None,
+    environment: Annotated[
+        str | None,
+        typer.Argument(
+            help="Name of the environment [default: list derivations].", autocompletion=completion.environments
+        ),
+    ] = None,
+    method: Annotated[
+        str | None,
+        typer.Argument(help="Derivation, such as occupancy_to_topology.", autocompletion=completion.derivations),
+    ] = None,
     option: Annotated[list[str] | None, options.named_values("A parameter of the derivation")] = None,
     message: options.Message = "",
     replace: options.Replace = False,
@@ -289,9 +326,11 @@ def derive(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Compute a layer from others and keep it as a version; without names, list the ways.
+    """Compute a layer from other layers and store it as a version. Without names, list the derivations.
 
-    The list is the server's, where one is named (by --server or FLEETMAP_SERVER) and answers; else it needs none.
+    The list comes from the server if you name one (--server or FLEETMAP_SERVER); otherwise it needs none.
+
+    Example: `fleetmap derive farm occupancy_to_topology -O robot_radius=0.3`
     """
     if environment is None:
         known = _derivations(server, token)

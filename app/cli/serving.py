@@ -57,7 +57,7 @@ DEMO_TOKEN = "demo-token"  # noqa: S105  the name of a file
 
 
 def serve(*, demo: bool = False, **values: Any) -> None:
-    """Start the server.
+    """Start the server, with a demo if you like.
 
     It runs in the foreground and stops cleanly on SIGTERM and Ctrl-C.
 
@@ -106,16 +106,18 @@ def _compile(folder: Path) -> None:
 
 def migrate(
     database_url: Annotated[
-        str | None, typer.Option("--database-url", help="The database [default: FLEETMAP_DATABASE_URL].")
+        str | None, typer.Option("--database-url", help="Database [default: FLEETMAP_DATABASE_URL].")
     ] = None,
     data_dir: Annotated[
-        Path | None, typer.Option("--data-dir", help="The server's folder [default: FLEETMAP_DATA_DIR].")
+        Path | None, typer.Option("--data-dir", help="Data folder of the server [default: FLEETMAP_DATA_DIR].")
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Bring the database to this release's schema.
+    """Migrate the database to the schema of this release.
 
-    PostgreSQL needs it before the server of a new release starts; SQLite is brought up at each start anyway.
+    PostgreSQL needs it before the server of a new release starts. SQLite is migrated at each start anyway.
+
+    Example: `fleetmap migrate --database-url postgresql+psycopg://fleetmap@db/fleetmap`
     """
     local.require_server_python("migrate")
     settings = load_settings({"database_url": database_url, "data_dir": data_dir})
@@ -129,9 +131,9 @@ def migrate(
 
 
 def demo(server: options.Server = None, token: options.Token = None, as_json: options.Json = False) -> None:
-    """Put the demo environment on a running server.
+    """Install the demo environment on a running server. A second time changes nothing.
 
-    Doing it again changes nothing.
+    Example: `fleetmap demo`
     """
     from app.cli import demo as orchard
 
@@ -204,7 +206,7 @@ def with_flags(function: Callable[..., None]) -> Callable[..., None]:
     def command(**values: Any) -> None:
         function(**values)
 
-    demo = Annotated[bool, typer.Option("--demo", help="Bring a small demo environment along, and commands to try.")]
+    demo = Annotated[bool, typer.Option("--demo", help="Install a small demo environment, and print commands to try.")]
     parameters: dict[str, tuple[Any, bool | None]] = {"demo": (demo, False)}
     for name, field in Settings.model_fields.items():
         if name in NOT_FLAGS:

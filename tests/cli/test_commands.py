@@ -128,14 +128,14 @@ def test_a_planned_promotion_waits(fleetmap: Fleetmap, network: Path) -> None:
 def test_a_promotion_in_two_stages(fleetmap: Fleetmap, network: Path) -> None:
     history(fleetmap, network, "staged")
     told = fleetmap("promote", "staged", "1", "--ready", "0.9", "--failed", "0.2", "--deadline", "2099-01-31T06:00:00Z")
-    assert told.out.strip() == "staged: production will stand on version 1 when 0.9 of its online robots have it"
+    assert told.out.strip() == "staged: production will point to version 1 when 0.9 of its online robots have it"
     body = fleetmap("promote", "staged", "1", "--ready", "0.9", "--window", "60", "--json").json
     assert body["version"] is None
     assert (body["rollout"]["state"], body["rollout"]["ready"], body["rollout"]["window"]) == ("waiting", 0.9, 60.0)
     assert "nothing is planned" in fleetmap("promote", "staged", "--cancel").out
     assert fleetmap("promote", "staged", "--cancel").status == 1, "there is nothing to cancel any more"
     assert fleetmap("promote", "staged", "--cancel", "--ready", "0.5").status == 2
-    assert fleetmap("promote", "staged", "1").out.strip() == "staged: production stands on version 1"
+    assert fleetmap("promote", "staged", "1").out.strip() == "staged: production points to version 1"
     assert "moves back" in fleetmap("promote", "staged", "2", "--failed", "0.2").out
     alone = fleetmap("promote", "staged", "2", "--window", "60")
     assert alone.status == 1
