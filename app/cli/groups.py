@@ -98,6 +98,7 @@ def show_help(command: Command | Group, ctx: Context) -> None:
         if getattr(text, "help", None):
             text.help = _markup(text.help)
     rich_utils.MAX_WIDTH = _width()
+    rich_utils.FORCE_TERMINAL = None  # rich itself decides on colours, and honours FORCE_COLOR and NO_COLOR
     rich_utils.rich_format_help(obj=command, ctx=ctx, markup_mode="rich")
 
 
