@@ -301,11 +301,10 @@ def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
                 raise
             why = str(refused)
     local.require_server_python("derive")
-    from app.api.derivations import as_dict
-    from app.derive import all_derivations
+    from app.catalogue import describe_derivations
 
     output.say(f"{why}: a server with a provider of satellite pictures also has location_to_imagery")
-    return [as_dict(d) for d in all_derivations().values()]
+    return describe_derivations()
 
 
 def derive(

@@ -270,14 +270,14 @@ def list_formats(
     Example: `fleetmap formats occupancy_grid`
     """
     local.require_server_python("formats")
-    from app import formats
-    from app.api.formats import as_dict
+    from app import catalogue, formats
 
     if format is not None:
         found = formats.get_format(format)
-        output.show_json(as_dict(found)) if as_json else _show_format(found, as_dict(found))
+        described = catalogue.describe_format(found)
+        output.show_json(described) if as_json else _show_format(found, described)
         return
-    known = [as_dict(f) for f in formats.all_formats().values()]
+    known = catalogue.describe_formats()
     if as_json:
         output.show_json(known)
         return
