@@ -1,4 +1,4 @@
-"""All commands of ``fleetmap``: where each is, in which panel of the help, and which of them a call needs."""
+"""The commands of ``fleetmap``: their modules, their panels in the help, and the one that a call needs."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def build(only: str | None = None) -> typer.Typer:
 
     Args:
         only: the command that is needed: others are neither imported nor built. All of them for None and for a name
-            that is no command's. Only where it is named does ``serve`` get an option for every setting: these import
+            that is no command's. Only if it is named, ``serve`` gets an option for every setting: these import
             the server's settings.
     """
     app = groups.Commands(

@@ -1,6 +1,6 @@
 """Completion in the shell: names of environments, formats, channels, levels and grids, as the server has them.
 
-It answers within TIMEOUT_SECONDS and says nothing where the server is away or refuses: completion prints no errors.
+It returns within TIMEOUT_SECONDS and is silent if the server is unavailable or refuses: completion prints no errors.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from app.errors import FleetMapError, Invalid
 from app.model.frame import Datum
 
 LABEL = 2
-"""Characters: words of a name up to this length tell siblings apart (``hall-a``, ``hall-b``); they are no slips."""
+"""Characters: words of a name up to this length distinguish siblings (``hall-a``, ``hall-b``); they are no slips."""
 
 LONG_WORD = 8
 """Characters from which a word may have two slips instead of one."""
@@ -66,14 +66,12 @@ def _check_new(client: Client, name: str, create: bool | None, refused: Refused)
     if create is None:
         near = slip(name, (row["name"] for row in client.pages("/environments", {}, limit=MAX_NAMES)))
         if near is not None:
-            raise Invalid(
-                f"there is no environment {name!r} (did you mean {near}?): give --create to create it all the same"
-            )
+            raise Invalid(f"there is no environment {name!r} (did you mean {near}?): use --create if the name is right")
 
 
 @contextmanager
 def _undone(undo: Any, failure: str) -> Iterator[None]:
-    """Undo what was prepared if the block fails or is interrupted; say so where that fails, too."""
+    """Undo the preparation if the block fails or is interrupted; report it if that fails as well."""
     try:
         yield
     except BaseException as error:
@@ -86,7 +84,7 @@ def _undone(undo: Any, failure: str) -> Iterator[None]:
 
 
 def _remove(client: Client, made: Mapping[str, Any]) -> None:
-    """Remove an environment for good, unless somebody has put something into it meanwhile."""
+    """Remove an environment permanently, unless another client has changed it since."""
     place = path_of("environments", made["name"])
     if client.get(place)["version"] == made["version"]:
         client.delete(place)
@@ -94,7 +92,7 @@ def _remove(client: Client, made: Mapping[str, Any]) -> None:
 
 
 def _take_back(client: Client, known: Mapping[str, Any]) -> None:
-    """Return to the version before a datum was set, unless somebody has gone on meanwhile."""
+    """Return to the version before the datum was set, unless another client has made a version since."""
     place = path_of("environments", known["name"])
     if client.get(place)["version"] == known["version"] + 1:
         message = "take back the datum: the import it was for failed"

@@ -24,7 +24,7 @@ PIPED_WIDTH = 100
 """Columns of help where the output is no terminal."""
 
 JSON = "fleetmap.json"
-"""Key in a context's ``meta``: whether ``--json`` stands before the command."""
+"""Key in a context's ``meta``: whether ``--json`` precedes the command."""
 
 LIST = "list"
 """Command of a group of things that runs if none is named."""
