@@ -26,6 +26,7 @@ from app.model.frame import GROUND, Datum, Level
 from app.model.geodesy import local_frame
 from app.model.imagery import Picture
 from app.model.layers import NETWORK, SITE, ZONES, Layer, Layers, Part, PartKey, Resources, is_empty, join_levels
+from app.model.names import did_you_mean
 
 TEMPLATE_FOLDERS = ("location", "metric", "topological", "world")
 """The folders of an environment_template's ``config``; the folder says what a drawing is meant for."""
@@ -48,6 +49,17 @@ _FENCE = re.compile(r"fence|boundary|perimeter", re.IGNORECASE)
 
 SAME_PLACE_DEGREES = 1e-7
 """About a centimetre: two fences whose corners are nearer are one."""
+
+
+def drawn_layer(name: str | None) -> Layer | None:
+    """Check the layer that a drawing is meant for. Raises Invalid with the layers that it may be."""
+    for layer in DRAWN_LAYERS:
+        if layer == name:
+            return layer
+    if name is None:
+        return None
+    problem = f"must be one of {', '.join(DRAWN_LAYERS)}, got {name[:80]!r}{did_you_mean(name, DRAWN_LAYERS)}"
+    raise Invalid(f"layer {problem}", [Problem(problem, where="layer")])
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +170,7 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
 
     Raises BadUpload with every place that is wrong; Invalid for hints that cannot be used.
     """
-    if hints.layer is not None and hints.layer not in DRAWN_LAYERS:
-        raise Invalid(f"layer must be one of {', '.join(DRAWN_LAYERS)}, got {hints.layer!r}")
+    drawn_layer(hints.layer)
     if not files:
         raise Invalid("the upload has no file: send at least one as form field 'files'")
     if hints.format is not None and formats.get_format(hints.format).holds:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import dataclasses
 import ipaddress
 import os
+import re
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal, Self
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -22,9 +24,36 @@ from app.logs import LogFormat
 
 _DEFAULTS = Limits()
 
+_UNITS = {"": 1, "b": 1} | {f"{p}b": 1000**n for n, p in enumerate("kmgt", 1)}
+_UNITS |= {f"{p}ib": 1024**n for n, p in enumerate("kmgt", 1)}
+_SIZE = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([a-z]*)", re.IGNORECASE)
+
+
+def parse_size(text: str) -> int:
+    """Parse a size such as ``512MiB``, ``2 GB`` or ``1048576`` as bytes. Raises ValueError."""
+    match = _SIZE.fullmatch(text.strip())
+    factor = _UNITS.get(match[2].lower()) if match else None
+    if match is None or factor is None:
+        raise ValueError(
+            f"must be a size in bytes, such as 512MiB or 2GB, got {text[:40]!r}: units are kB, MB, GB and TB "
+            "(powers of 1000), KiB, MiB, GiB and TiB (powers of 1024)"
+        )
+    size = Decimal(match[1]) * factor
+    if size != int(size):
+        raise ValueError(f"must be a whole number of bytes, got {text[:40]!r}")
+    return int(size)
+
+
+def format_size(size: int) -> str:
+    """Format bytes as ``parse_size`` takes them, with the largest unit that leaves a whole number."""
+    for unit, factor in (("GiB", 2**30), ("MiB", 2**20), ("KiB", 2**10)):
+        if size and size % factor == 0:
+            return f"{size // factor}{unit}"
+    return str(size)
+
 
 class Settings(BaseSettings):
-    """Everything an operator can set. Sizes are bytes, times are seconds."""
+    """Everything an operator can set. Times are seconds. Sizes (``…_bytes``) are bytes, or a number with a unit."""
 
     model_config = SettingsConfigDict(env_prefix="FLEETMAP_", env_file=".env", extra="ignore", frozen=True)
 
@@ -321,6 +350,12 @@ class Settings(BaseSettings):
     @classmethod
     def _empty_is_unset(cls, value: Any) -> Any:
         return None if value == "" else value
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _sizes_have_units(cls, value: Any, info: ValidationInfo) -> Any:
+        sized = isinstance(value, str) and str(info.field_name).endswith("_bytes")
+        return parse_size(value) if sized else value
 
     @field_validator("blob_url")
     @classmethod

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from app.errors import Invalid, Problem
+from app.model.names import did_you_mean
 
 T = TypeVar("T")
 
@@ -41,7 +42,7 @@ def parse(cls: type[T], values: Mapping[str, Any], what: str = "parameter") -> T
     for name, value in values.items():
         if name not in known:
             accepted = ", ".join(known) or "none"
-            problems.append(Problem(f"no such {what}; accepted: {accepted}", where=name))
+            problems.append(Problem(f"no such {what}{did_you_mean(name, known)}; accepted: {accepted}", where=name))
             continue
         try:
             out[name] = _convert(hints[name], value)

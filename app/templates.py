@@ -15,6 +15,7 @@ from typing import Any, Final
 from app import formats, parameters
 from app.errors import Invalid, NotFound, Problem
 from app.formats import Format
+from app.model.names import did_you_mean
 from app.model.templates import DEFAULT_SET, Own, Templates
 
 REQUEST, ENVIRONMENT, DEFAULT = "request", "environment", "default"
@@ -97,7 +98,8 @@ NOTHING: Final = Resolved()
 def check_set(name: str, where: str = "set") -> str:
     """Invalid, with the known ones, where there is no such set."""
     if name not in SETS:
-        reason = f"there is no template set {name[:80]!r}; known sets: {', '.join(SETS)}"
+        near = did_you_mean(name, SETS)
+        reason = f"there is no template set {name[:80]!r}{near}; known sets: {', '.join(SETS)}"
         raise Invalid(reason, [Problem(reason, where=where)])
     return name
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from app.cli import build
+from app.cli.commands import build
 from app.config import Settings
 from app.formats import all_formats
 

@@ -14,6 +14,7 @@ from fastapi.routing import APIRoute
 from starlette.responses import Response
 
 from app.errors import Invalid, Problem
+from app.model.names import did_you_mean
 
 API = "/api/v1"
 
@@ -76,8 +77,9 @@ class Route(APIRoute):
                 unknown = sorted(set(request.query_params) - known)
                 if unknown:
                     accepted = ", ".join(sorted(known)) or "none"
+                    near = did_you_mean(unknown[0], known)
                     raise Invalid(
-                        f"unknown query parameter {unknown[0][:80]!r}; accepted: {accepted}",
+                        f"unknown query parameter {unknown[0][:80]!r}{near}; accepted: {accepted}",
                         [Problem(f"unknown; accepted: {accepted}", where=name[:80]) for name in unknown[:20]],
                     )
             return await handler(_Request(request.scope, request.receive))

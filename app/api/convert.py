@@ -21,12 +21,13 @@ from app.api.schemas import DatumBody, told
 from app.api.services import Here, Services
 from app.api.uploads import Form
 from app.api.versions import check_names, format_named, truth
-from app.bundle import DRAWN_LAYERS, Hints
+from app.bundle import DRAWN_LAYERS, Hints, drawn_layer
 from app.convert import Converted
 from app.convert.make import media_type, zipped
 from app.errors import Invalid, Problem
 from app.ingest.service import check_grid_name
 from app.model.frame import GROUND, Datum, Level
+from app.model.names import did_you_mean
 
 router = APIRouter(tags=["formats"], route_class=Route)
 
@@ -93,9 +94,7 @@ def _convert(here: Services, form: Form) -> Response:
         raise Invalid("say in the field 'to' which format is wanted", [Problem("missing", where="to")])
     known = formats.get_format(to)
     check_names(form.files)
-    layer = fields.pop("layer", "") or None
-    if layer is not None and layer not in DRAWN_LAYERS:
-        raise Invalid(f"layer must be one of {', '.join(DRAWN_LAYERS)}", [Problem("unknown", where="layer")])
+    layer = drawn_layer(fields.pop("layer", "") or None)
     source = format_named(fields.pop("format", ""), "format")
     level = fields.pop("level", "") or GROUND
     Level(level)
@@ -107,7 +106,7 @@ def _convert(here: Services, form: Form) -> Response:
     read = {p["name"] for f in formats.all_formats().values() if f.read for p in parameters.describe(f.read_options)}
     for name in fields.keys() - written - read:
         accepted = ", ".join(sorted(written)) or "none"
-        detail = f"{to} has no parameter {name[:80]!r}; accepted: {accepted}"
+        detail = f"{to} has no parameter {name[:80]!r}{did_you_mean(name, written | read)}; accepted: {accepted}"
         raise Invalid(detail, [Problem(f"unknown; accepted: {accepted}", where=name[:80])])
     hints = Hints(source, layer, level, grid, {k: v for k, v in fields.items() if k not in written})
     values = {k: v for k, v in fields.items() if k in written}

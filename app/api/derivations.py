@@ -13,24 +13,11 @@ from app.api.answers import Route, answer
 from app.api.schemas import DerivationBody, DerivationOut, EnvironmentPath, IdempotencyKey, IfMatch, VersionOut, told
 from app.api.services import Here
 from app.api.versions import told_as
-from app.derive import Derivation
+from app.catalogue import describe_derivations
 from app.errors import Invalid, NotFound, Problem
 from app.ingest import Wish, online
 
 router = APIRouter(tags=["derivations"], route_class=Route)
-
-
-def as_dict(known: Derivation) -> dict[str, Any]:
-    """The derivation as clients see it."""
-    return {
-        "id": known.name,
-        "title": known.title,
-        "gives": known.gives,
-        "needs": sorted(known.needs),
-        "cost": known.cost,
-        "version": known.version,
-        "parameters": parameters.describe(known.parameters),
-    }
 
 
 def as_online() -> dict[str, Any]:
@@ -49,8 +36,7 @@ def as_online() -> dict[str, Any]:
 @router.get("/derivations", responses=told(list[DerivationOut]), summary="All derivations")
 def list_derivations(here: Here, _: Viewer) -> Response:
     """What can be computed from what. Maps use them by themselves; their parameters go into a map's query."""
-    known = [as_dict(one) for one in derive.all_derivations().values()]
-    return answer(known + ([as_online()] if here.ingest.provider is not None else []))
+    return answer(describe_derivations() + ([as_online()] if here.ingest.provider is not None else []))
 
 
 @router.post(

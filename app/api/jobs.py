@@ -3,29 +3,30 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Query
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from app.api import problems
 from app.api.access import Principal, Viewer
 from app.api.answers import Route, answer, path_of
-from app.api.schemas import JobOut, JobPath, told
+from app.api.schemas import JobOut, JobPath, Limit, told
 from app.api.services import Here
 from app.convert import Maps, Recipe
 from app.convert.cache import Made
 from app.errors import FleetMapError, NotFound, Unavailable
 from app.pool import Cancelled, Stop
 from app.store import Store
-from app.store.values import Job, rfc3339
+from app.store.values import Job, State, rfc3339
 
 log = logging.getLogger(__name__)
 
@@ -209,6 +210,20 @@ def _mine(here: Here, who: Principal, id: str) -> Job:
     if job.owner != who.id and not (who.can("admin") and who.environments is None):
         raise NotFound(f"there is no job {id[:80]!r}")
     return job
+
+
+@router.get("", responses=told(list[JobOut]), summary="List jobs")
+def list_jobs(
+    here: Here,
+    who: Viewer,
+    state: Annotated[State | None, Query(description="Only jobs in this state.")] = None,
+    limit: Limit = 100,
+) -> Response:
+    """List the jobs of the own token, newest first; administrators whose token is for all environments see all."""
+    every = who.role == "admin" and who.environments is None
+    mine = (job for job in reversed(here.store.jobs()) if every or job.owner == who.id)
+    found = (body for body in map(as_dict, mine) if state in (None, body["state"]))
+    return answer(list(itertools.islice(found, limit)))
 
 
 @router.get("/{id}", responses=told(JobOut, 404), summary="How far a job is")

@@ -32,7 +32,7 @@ from app.api.schemas import (
 )
 from app.api.services import Here, Services
 from app.api.uploads import Form
-from app.bundle import DRAWN_LAYERS
+from app.bundle import DRAWN_LAYERS, drawn_layer
 from app.errors import FleetMapError, Invalid, NotFound, Problem
 from app.ingest import Outcome, SpooledFile, Upload
 from app.ingest.service import bad_name
@@ -268,9 +268,7 @@ def _upload(form: Form, request: Request) -> Upload:
         if name in fields:
             raise Invalid(f"{name[:80]!r} is given twice", [Problem("given twice", where=name[:80])])
         fields[name] = value
-    layer = fields.pop("layer", "") or None
-    if layer is not None and layer not in DRAWN_LAYERS:
-        raise Invalid(f"layer must be one of {', '.join(DRAWN_LAYERS)}", [Problem("unknown", where="layer")])
+    layer = drawn_layer(fields.pop("layer", "") or None)
     mode = fields.pop("mode", "") or "replace"
     if mode not in ("replace", "merge"):
         raise Invalid("mode must be replace or merge", [Problem("unknown", where="mode")])

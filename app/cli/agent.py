@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli import options, output
+from app.cli import completion, options, output
 
 
 def _copy_ros_package(workspace: Path | None) -> None:
@@ -28,7 +28,10 @@ def _copy_ros_package(workspace: Path | None) -> None:
 
 
 def agent(
-    environment: Annotated[str, typer.Option("--environment", "-e", help="Name of the environment.")],
+    environment: Annotated[
+        str,
+        typer.Option("--environment", "-e", help="Name of the environment.", autocompletion=completion.environments),
+    ],
     formats: Annotated[
         str,
         typer.Option(
@@ -42,7 +45,12 @@ def agent(
         str, typer.Option("--optional", help="Optional formats, comma-separated: installed if the server has them.")
     ] = "",
     channel: Annotated[
-        str | None, typer.Option("--channel", help="Channel to follow [default: production if it exists, else latest].")
+        str | None,
+        typer.Option(
+            "--channel",
+            help="Channel to follow [default: production if it exists, else latest].",
+            autocompletion=completion.versions,
+        ),
     ] = None,
     robot: Annotated[
         str | None, typer.Option("--robot", envvar="FLEETMAP_ROBOT", help="Name of the robot [default: this host's].")
@@ -64,33 +72,49 @@ def agent(
         typer.Option(
             "--key",
             envvar="FLEETMAP_AGENT_KEY",
-            help="The server's key to trust: its id or public_key [default: the one of the first contact].",
+            help="Key of the server to trust: its id or public key (`fleetmap keys show`) [default: the first seen].",
         ),
     ] = None,
     poll: Annotated[
-        float, typer.Option("--poll", min=0.1, help="Seconds between polls, give or take a half; events come at once.")
+        float,
+        typer.Option(
+            "--poll", min=0.1, help="Seconds between polls, up to a half more or less; events arrive at once."
+        ),
     ] = 60.0,
     zenoh_connect: Annotated[
         str | None,
-        typer.Option("--zenoh", envvar="FLEETMAP_ZENOH_CONNECT", help="Zenoh router [default: the server tells it]."),
+        typer.Option(
+            "--zenoh",
+            envvar="FLEETMAP_ZENOH_CONNECT",
+            help="Address of the Zenoh router [default: the server names it].",
+        ),
     ] = None,
     zenoh_prefix: Annotated[
-        str | None, typer.Option("--zenoh-prefix", envvar="FLEETMAP_ZENOH_PREFIX", help="Start of every key.")
+        str | None,
+        typer.Option("--zenoh-prefix", envvar="FLEETMAP_ZENOH_PREFIX", help="Start of every key expression."),
     ] = None,
     zenoh_config: Annotated[
         Path | None,
-        typer.Option("--zenoh-config", envvar="FLEETMAP_ZENOH_CONFIG", help="Zenoh's own JSON5, for all else."),
+        typer.Option(
+            "--zenoh-config",
+            envvar="FLEETMAP_ZENOH_CONFIG",
+            help="JSON5 file with Zenoh's own settings, for everything else.",
+        ),
     ] = None,
     zenoh_ca: Annotated[
         Path | None,
         typer.Option(
-            "--zenoh-ca", envvar="FLEETMAP_ZENOH_CA", help="Who signs the router's certificate, PEM [default: public]."
+            "--zenoh-ca",
+            envvar="FLEETMAP_ZENOH_CA",
+            help="Authority that signs the router's certificate, PEM [default: public ones].",
         ),
     ] = None,
     zenoh_certificate: Annotated[
         Path | None,
         typer.Option(
-            "--zenoh-certificate", envvar="FLEETMAP_ZENOH_CERTIFICATE", help="The robot's own, where one is asked for."
+            "--zenoh-certificate",
+            envvar="FLEETMAP_ZENOH_CERTIFICATE",
+            help="Certificate of the robot, if the router needs one.",
         ),
     ] = None,
     zenoh_key: Annotated[
@@ -98,11 +122,17 @@ def agent(
     ] = None,
     zenoh_user: Annotated[
         str | None,
-        typer.Option("--zenoh-user", envvar="FLEETMAP_ZENOH_USER", help="User at the router [default: the robot]."),
+        typer.Option(
+            "--zenoh-user", envvar="FLEETMAP_ZENOH_USER", help="User name at the router [default: the robot's name]."
+        ),
     ] = None,
     ca: Annotated[
         Path | None,
-        typer.Option("--ca", envvar="FLEETMAP_CA", help="Who signs the server's certificate, PEM [default: public]."),
+        typer.Option(
+            "--ca",
+            envvar="FLEETMAP_CA",
+            help="Authority that signs the server's certificate, PEM [default: public ones].",
+        ),
     ] = None,
     ros_package: Annotated[  # noqa: ARG001  its callback
         Path | None,
@@ -114,16 +144,18 @@ def agent(
             help="Copy the ROS 2 package fleetmap_ros into this folder (a workspace's src) and exit.",
         ),
     ] = None,
-    once: Annotated[bool, typer.Option("--once", help="Bring the folder up to date once, and end.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Bring the folder up to date once, and exit.")] = False,
     server: options.Server = None,
     token: options.Token = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for all that happens.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each event.")] = False,
 ) -> None:
-    """Keep a robot's folder up to date with a channel's map.
+    """Keep a folder on a robot up to date with the map of a channel.
 
-    Listens for events, fetches what differs, verifies signature and hashes, and switches `current` in one step. Keeps
-    the map without a server or network, and reports the robot's status. FLEETMAP_ZENOH_PASSWORD is its password at the
-    Zenoh router.
+    It listens for events, fetches what differs, verifies signature and hashes, switches `current` in one step, and
+    reports the robot's status. Without a server or network the folder keeps its map. FLEETMAP_ZENOH_PASSWORD is the
+    password at the Zenoh router.
+
+    Example: `fleetmap agent -e farm -f occupancy_grid,tmap2 -o /srv/maps --channel production --on-change nav2`
     """
     from app.agent.core import Agent, Options, robot_name
     from app.agent.requests import parse_formats
@@ -190,12 +222,14 @@ def agent(
 def agent_level(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory of the agent (`--into`).")],
     level: Annotated[str, typer.Argument(help="Level that the robot is on now, as in `current/levels.json`.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for all that happens.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each event.")] = False,
 ) -> None:
     """Load another level of the robot's map, for example after a ride in a lift.
 
     Runs the agent's `--on-change` commands for that level and stores the level for later maps. Run it as the agent's
     user; the agent may be running.
+
+    Example: `fleetmap agent-level /srv/maps L2`
     """
     from app.agent.activation import hook_variables
     from app.agent.levels import load_level

@@ -8,45 +8,56 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli import options, output
+from app.cli import completion, options, output
 from app.cli.client import Client, path_of
 from app.errors import Invalid
 
 
 def align(
-    environment: Annotated[str, typer.Argument(help="Name of the environment.")],
+    environment: options.Environment,
     onto: Annotated[
         str | None,
-        typer.Argument(help="What it is laid onto: objects, voxels, or the name of another grid; or give --pair."),
+        typer.Argument(help="Map to lay it onto: objects, voxels, or the name of another grid; or give --pair."),
     ] = None,
-    grid: Annotated[str, typer.Option("--grid", help="The grid that is moved.")] = "map",
+    grid: Annotated[str, typer.Option("--grid", help="Grid to move.", autocompletion=completion.grids)] = "map",
     level: options.Level = "ground",
     onto_level: Annotated[
-        str | None, typer.Option("--onto-level", help="The storey of what it is laid onto [default: the grid's].")
+        str | None, typer.Option("--onto-level", help="Level of the map to lay it onto [default: the grid's].")
     ] = None,
     pair: Annotated[
         list[str] | None,
-        typer.Option("--pair", metavar="X,Y=X,Y", help="A point where it is, and where it should be, m; repeatable."),
+        typer.Option(
+            "--pair", metavar="X,Y=X,Y", help="Where a point is, and where it should be, in metres; repeatable."
+        ),
     ] = None,
-    option: Annotated[list[str] | None, options.named_values("Of the slice of objects or voxels (height …)")] = None,
-    angle: Annotated[float, typer.Option("--angle", min=0, max=180, help="The largest turn that is tried, °.")] = 180.0,
+    option: Annotated[
+        list[str] | None, options.named_values("A parameter of the slice of objects or voxels (height, …)")
+    ] = None,
+    angle: Annotated[float, typer.Option("--angle", min=0, max=180, help="Maximum turn to try, in degrees.")] = 180.0,
     reach: Annotated[
-        float | None, typer.Option("--reach", min=0, help="The farthest that the grid's middle may go, m.")
+        float | None, typer.Option("--reach", min=0, help="Maximum distance to move the middle of the grid, in metres.")
     ] = None,
     near: Annotated[
         float | None,
-        typer.Option("--near", help="What agrees, m: cells [default: 0.1] or points [default: 0.5] this near."),
+        typer.Option(
+            "--near", help="Distance at which two cells [default: 0.1] or points [default: 0.5] agree, in metres."
+        ),
     ] = None,
-    least: Annotated[float, typer.Option("--least", min=0, max=1, help="The share that has to agree.")] = 0.5,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what is found.")] = False,
+    least: Annotated[
+        float, typer.Option("--least", min=0, max=1, help="Minimum share of cells or points that agree.")
+    ] = 0.5,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show the result; store nothing.")] = False,
     message: options.Message = "",
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Find where a grid lies on another map, tell how well it fits, and put it there as a version.
+    """Lay an occupancy grid onto another map of its environment, and store it there as a version.
 
-    Its origin changes, its cells do not: `fleetmap export … occupancy_grid -O normalize=true` bakes a turn into cells.
+    It reports how well the grid fits. The grid's origin changes, its cells do not: to turn the cells as well, use
+    `fleetmap export … occupancy_grid -O normalize=true`.
+
+    Example: `fleetmap align farm objects --grid map --dry-run`
     """
     body: dict[str, Any] = {"grid": grid, "level": level, "angle": angle, "reach": reach, "near": near}
     body |= {"least": least, "dry_run": dry_run, "message": message}

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from email.message import Message
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import IO, Any
-from urllib.parse import quote, urljoin
+from urllib.parse import quote, unquote, urljoin
 
 import httpx
 
-from app.cli.output import Bar, progress_bar
+from app.cli import variables
+from app.cli.output import Bar, progress_bar, say
+from app.cli.problems import Refused
 from app.events.login import trusting
+from app.model.names import did_you_mean
 
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 API = "/api/v1"
@@ -36,16 +40,14 @@ POLL_SECONDS = 0.3
 
 MAX_POLL_SECONDS = 2.0
 
+STREAM_SECONDS = 60.0
+"""Longest silence of a stream of events, in seconds: the server sends a comment every 15."""
+
+MAX_NAMES = 1000
+"""Names of environments that a mistyped one is compared with."""
+
 TIMEOUT = httpx.Timeout(10.0, read=330.0, write=60.0)
 """Seconds. A conversion may take its server up to 300 seconds before it answers."""
-
-
-class Refused(Exception):
-    """The server's answer is a problem, or there is no answer. ``problem`` has RFC 9457's members."""
-
-    def __init__(self, problem: Mapping[str, Any], *, status: int | None = None, hint: str = "") -> None:
-        super().__init__(str(problem.get("detail") or problem.get("title") or "refused"))
-        self.problem, self.status, self.hint = dict(problem), status, hint
 
 
 @dataclass(slots=True)
@@ -112,6 +114,8 @@ class Client:
         if "://" not in self.server:
             self.server = f"http://{self.server}"
         self.token = token or os.environ.get("FLEETMAP_TOKEN") or None
+        for warning in variables.mistyped(os.environ):
+            say(f"warning: {warning}", style="yellow")
         headers = {"User-Agent": "fleetmap"}
         if self.token:
             headers["Authorization"] = f"Bearer {self.token}"
@@ -145,23 +149,23 @@ class Client:
     def post(self, path: str, body: Mapping[str, Any], *, repeat: bool = False) -> Any:
         """Send JSON; ``repeat`` where the server recognises the same request by its Idempotency-Key."""
         headers = {"Idempotency-Key": secrets.token_hex(16)} if repeat else {}
-        return self._json(self._send("POST", path, json=_present(body), headers=headers, repeat=repeat))
+        return self._json(self._send("POST", path, content=_present(body), headers=headers, repeat=repeat))
 
     def post_until_done(self, path: str, body: Mapping[str, Any]) -> Any:
         """Send JSON that may be sent again; where it becomes a job, wait for its end with a bar and send it again."""
         while True:
-            answer = self._send("POST", path, json=_present(body), repeat=True)
+            answer = self._send("POST", path, content=_present(body), repeat=True)
             if answer.status_code != httpx.codes.ACCEPTED:
                 return self._json(answer)
             self._wait(answer)
 
     def put(self, path: str, body: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> Any:
         """Put JSON."""
-        return self._json(self._send("PUT", path, json=_present(body), headers=headers, repeat=True))
+        return self._json(self._send("PUT", path, content=_present(body), headers=headers, repeat=True))
 
     def patch(self, path: str, body: Mapping[str, Any]) -> Any:
         """Change some members."""
-        return self._json(self._send("PATCH", path, json=_present(body)))
+        return self._json(self._send("PATCH", path, content=_present(body)))
 
     def delete(
         self, path: str, params: Mapping[str, Any] | None = None, headers: Mapping[str, str] | None = None
@@ -182,6 +186,30 @@ class Client:
             if "next" not in answer.links:
                 return
             where, query = urljoin(str(answer.url), answer.links["next"]["url"]), {}
+
+    def stream(self, path: str, params: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+        """Yield server-sent events as ``{id, type, data}`` until the server ends the stream."""
+        timeout = httpx.Timeout(10.0, read=STREAM_SECONDS)
+        with (
+            self._reach(),
+            self._http.stream("GET", self._address(path), params=_present(params), timeout=timeout) as answer,
+        ):
+            if answer.status_code != httpx.codes.OK:
+                answer.read()
+                self._check(answer)
+            event: dict[str, Any] = {}
+            for line in answer.iter_lines():
+                name, _, value = line.partition(":")
+                value = value.removeprefix(" ")
+                if name == "id":
+                    event["id"] = int(value)
+                elif name == "event":
+                    event["type"] = value
+                elif name == "data":
+                    event["data"] = json.loads(value)
+                elif not line and "data" in event:
+                    yield event
+                    event = {}
 
     # --- files ---
 
@@ -210,7 +238,7 @@ class Client:
                 if answer.status_code == httpx.codes.OK:
                     return _receive(answer, target)
                 answer.read()
-                _check(answer, self.token)
+                self._check(answer)
             self._wait(answer)  # made by now: asking again gets it from the cache
 
     # --- inside ---
@@ -225,7 +253,7 @@ class Client:
         path: str,
         *,
         params: Mapping[str, Any] | None = None,
-        json: Any = None,
+        content: Any = None,
         headers: Mapping[str, str] | None = None,
         repeat: bool = False,
         body: Callable[[], dict[str, Any]] | None = None,
@@ -237,7 +265,7 @@ class Client:
                     method,
                     self._address(path),
                     params=params or None,
-                    json=json,
+                    json=content,
                     headers=headers,
                     **(body() if body else {}),
                 )
@@ -249,11 +277,38 @@ class Client:
             else:
                 busy = answer.status_code in (httpx.codes.SERVICE_UNAVAILABLE, httpx.codes.TOO_MANY_REQUESTS)
                 if not (busy and repeat and left and "Retry-After" in answer.headers):
-                    _check(answer, self.token)
+                    self._check(answer)
                     return answer
                 pause = _seconds(answer.headers["Retry-After"], pause)
             time.sleep(pause)
         raise AssertionError("the last try returns or raises")
+
+    def _check(self, answer: httpx.Response) -> None:
+        """Raise Refused with the problem of an error, and a hint."""
+        if answer.status_code < 400:
+            return
+        problem: Any = None
+        if "json" in answer.headers.get("Content-Type", ""):
+            try:
+                problem = answer.json()
+            except ValueError:
+                problem = None
+        if not isinstance(problem, dict):
+            problem = {"title": answer.reason_phrase, "detail": f"{answer.url} answered {answer.status_code}"}
+        hint = _hint(answer, self.token)
+        if answer.status_code == httpx.codes.NOT_FOUND and "no environment" in str(problem.get("detail")):
+            hint = self._other_environments(answer.url)
+        raise Refused(problem, status=answer.status_code, hint=hint)
+
+    def _other_environments(self, url: httpx.URL) -> str:
+        """Return the environment that a mistyped one probably means; only those that the token may see."""
+        wanted = unquote(url.params.get("environment") or url.path.removeprefix(f"{API}/environments/").split("/")[0])
+        near = ""
+        if url.path != f"{API}/environments":
+            with suppress(Refused):
+                near = did_you_mean(wanted, (row["name"] for row in self.pages("/environments", {}, limit=MAX_NAMES)))
+        question = near.strip(" ()").capitalize()
+        return f"{question} `fleetmap environment list` lists all.".strip()
 
     @contextmanager
     def _reach(self) -> Iterator[None]:
@@ -346,24 +401,10 @@ def _unreachable(server: str, error: httpx.TransportError) -> Refused:
     return Refused({"title": "Server unreachable", "detail": detail}, hint=hint)
 
 
-def _check(answer: httpx.Response, token: str | None) -> None:
-    if answer.status_code < 400:
-        return
-    problem: Any = None
-    if "json" in answer.headers.get("Content-Type", ""):
-        try:
-            problem = answer.json()
-        except ValueError:
-            problem = None
-    if not isinstance(problem, dict):
-        problem = {"title": answer.reason_phrase, "detail": f"{answer.url} answered {answer.status_code}"}
-    hint = ""
+def _hint(answer: httpx.Response, token: str | None) -> str:
+    """Return what to do about an error on the command line."""
+    if answer.status_code == httpx.codes.UNAUTHORIZED and token:
+        return "Give another with --token or FLEETMAP_TOKEN."
     if answer.status_code == httpx.codes.UNAUTHORIZED:
-        hint = (
-            "Give another with --token or FLEETMAP_TOKEN."
-            if token
-            else "Give a token with --token or FLEETMAP_TOKEN; the server's first start printed the administrator's."
-        )
-    elif answer.status_code == httpx.codes.NOT_FOUND and "no environment" in str(problem.get("detail")):
-        hint = "`fleetmap versions` lists all."
-    raise Refused(problem, status=answer.status_code, hint=hint)
+        return "Give a token with --token or FLEETMAP_TOKEN; the server's first start printed the administrator's."
+    return ""

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from app.cli.client import Client, Refused, path_of
+from app.cli.client import Client, path_of
+from app.cli.problems import Refused
 
 NAME = "orchard"
 TITLE = "Demo orchard"

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli import local, options, output, write
-from app.cli.client import Client, Refused, path_of
+from app.cli import completion, local, options, output, write
+from app.cli.client import Client, path_of
+from app.cli.created import ensured
 from app.cli.folder import check_name, environment_name
 from app.cli.history import show_made
 from app.cli.maps import show_report
@@ -20,27 +21,48 @@ if TYPE_CHECKING:
 
 def generate(
     site: Annotated[
-        str | None, typer.Argument(help="The generator, such as orchard or warehouse [default: list them].")
+        str | None,
+        typer.Argument(
+            help="Generator, such as orchard or warehouse [default: list generators].",
+            autocompletion=completion.generators,
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="The same seed gives the same site again.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, help="Number to start from: the same seed gives the same site again.")
+    ] = 0,
     environment: Annotated[
-        str | None, typer.Option("--environment", "-e", help="Where to keep it [default: SITE-SEED, made if absent].")
+        str | None,
+        typer.Option(
+            "--environment",
+            "-e",
+            help="Environment to store it in, created if it does not exist [default: SITE-SEED].",
+            autocompletion=completion.environments,
+        ),
     ] = None,
     option: Annotated[list[str] | None, options.named_values("A parameter of the generator")] = None,
     datum: options.DatumText = None,
     to: Annotated[
-        str | None, typer.Option("--to", help="Write a map in this format instead; needs no server, keeps nothing.")
+        str | None,
+        typer.Option(
+            "--to",
+            help="Write a map in this format instead: needs no server, stores nothing.",
+            autocompletion=completion.formats,
+        ),
     ] = None,
     out: options.Output = None,
+    create: options.Create = None,
     message: options.Message = "",
     replace: options.Replace = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Make up a site: rows, rooms, streets, caves … with all their maps; without a name, list the generators.
+    """Generate a synthetic site with all its maps: rows of trees, rooms, streets, caves, … Without a name, list them.
 
-    The list and ``--to FORMAT -o FILE`` need no server. With ``--to``, options may also be the format's.
+    The list and `--to FORMAT -o FILE` need no server. With --to, -O also takes parameters of the format. An
+    environment that does not exist is created, and removed again if the generator fails.
+
+    Example: `fleetmap generate orchard --seed 7 -O rows=6 -e orchard-7`
     """
     if site is None:
         _list(as_json=as_json)
@@ -53,8 +75,11 @@ def generate(
         name = environment or environment_name(f"{site}-{seed}")
         check_name(name)
         body = {"generator": site, "seed": seed, "parameters": values, "message": message, "replace": replace}
-        with Client(server, token) as client, output.progress_bar(f"generating {site}"):
-            _ensure(client, name, place)
+        with (
+            Client(server, token) as client,
+            output.progress_bar(f"generating {site}"),
+            ensured(client, name, datum=place, create=create if environment else True),
+        ):
             made = client.post(path_of("environments", name, "generations"), body, repeat=True)
         show_made(name, made, as_json=as_json)
         return
@@ -88,19 +113,6 @@ def _list(*, as_json: bool) -> None:
             for one in known
         ],
     )
-
-
-def _ensure(client: Client, name: str, datum: Datum | None) -> None:
-    """Make sure that the environment is there and has the datum that was asked for."""
-    try:
-        known = client.get(path_of("environments", name))
-    except Refused as refused:
-        if refused.status != 404:
-            raise
-        client.post("/environments", {"name": name, "datum": datum.as_dict() if datum else None})
-        return
-    if datum is not None and (known.get("datum") or {}) != datum.as_dict():
-        client.patch(path_of("environments", name), {"datum": datum.as_dict()})
 
 
 def _write(

@@ -8,25 +8,32 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli import local, options, output
-from app.cli.client import Client, Refused, path_of
-
-Environment = Annotated[str, typer.Argument(help="Name of the environment.")]
+from app.cli import completion, local, options, output
+from app.cli.client import Client, path_of
+from app.cli.environments import list_environments
+from app.cli.problems import Refused
 
 
 def versions(
-    environment: Annotated[str | None, typer.Argument(help="Name of the environment [default: list them all].")] = None,
-    limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="How many, newest first.")] = 20,
+    environment: Annotated[
+        str | None,
+        typer.Argument(
+            help="Name of the environment [default: list all environments].", autocompletion=completion.environments
+        ),
+    ] = None,
+    limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="Maximum number, newest first.")] = 20,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """An environment's history; without a name, all environments.
+    """List the versions of an environment, newest first, with the channels that point to each.
 
-    The newest version comes first; each is told with the channels that stand on it.
+    Without a name it lists all environments, as `environment list` does.
+
+    Example: `fleetmap versions farm`
     """
     if environment is None:
-        _environments(limit, server, token, as_json=as_json)
+        list_environments(limit=limit, server=server, token=token, as_json=as_json)
         return
     with Client(server, token) as client:
         page = {"limit": min(limit, 100)}
@@ -41,7 +48,7 @@ def versions(
             (
                 row["version"],
                 ", ".join(standing.get(row["version"], ())),
-                _minute(row.get("time")),
+                output.minute(row.get("time")),
                 row.get("author"),
                 row.get("message"),
                 summary(row.get("changes") or {}),
@@ -52,60 +59,94 @@ def versions(
 
 
 def diff(
-    environment: Environment,
-    old: Annotated[str, typer.Argument(metavar="FROM", help="Version number or channel.")],
-    new: Annotated[str, typer.Argument(metavar="TO", help="Version number or channel.")] = "latest",
+    environment: options.Environment,
+    old: Annotated[
+        str, typer.Argument(metavar="FROM", help="Version number or channel.", autocompletion=completion.versions)
+    ],
+    new: Annotated[
+        str, typer.Argument(metavar="TO", help="Version number or channel.", autocompletion=completion.versions)
+    ] = "latest",
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """What differs between two versions, item by item."""
+    """Show what differs between two versions: a summary, then item by item (+ added, ~ changed, - deleted).
+
+    Example: `fleetmap diff farm production latest`
+    """
     with Client(server, token) as client:
         told = client.get(path_of("environments", environment, "diff"), {"from": old, "to": new})
     if as_json:
         output.show_json(told)
         return
-    layers = told.get("layers") or {}
-    lines = 0
-    for layer, change in layers.items():
-        for line in _lines(layer, change):
-            output.show(line)
-            lines += 1
+    old, new = str(told.get("from", old)), str(told.get("to", new))
+    lines = [line for layer, change in (told.get("layers") or {}).items() for line in _lines(layer, change)]
     if not lines:
-        output.show(f"versions {told.get('from', old)} and {told.get('to', new)} hold the same")
+        output.show(f"versions {old} and {new} have the same content")
+        return
+    parts = filter(None, (_summary(layer, change) for layer, change in told["layers"].items()))
+    output.show(f"versions {old} → {new}: {'; '.join(parts)}")
+    for line in lines:
+        output.show(line)
+
+
+def _summary(layer: str, change: Mapping[str, Any]) -> str:
+    """Summarise a layer's differences: ``topology 2 added, 1 deleted``, ``occupancy map (30 freed)``."""
+    if layer in ("datum", "templates"):
+        return f"{layer} changed"
+    if any(isinstance(change.get(kind), list) for kind in ("added", "changed", "deleted")):
+        return f"{layer} {counts({kind: len(change.get(kind) or ()) for kind in ('added', 'changed', 'deleted')})}"
+    return f"{layer} {counts(change)}" if any(change.values()) else ""
 
 
 def promote(
-    environment: Environment,
+    environment: options.Environment,
     version: Annotated[
-        str, typer.Argument(help="Version number or channel that the channel is to stand on.")
+        str,
+        typer.Argument(
+            help="Version number or channel that the channel is to point to.", autocompletion=completion.versions
+        ),
     ] = "latest",
-    channel: Annotated[str, typer.Option("--channel", "-c", help="The channel to move.")] = "production",
-    at: Annotated[str | None, typer.Option("--at", metavar="TIME", help="Activate then (RFC 3339), not now.")] = None,
+    channel: Annotated[
+        str, typer.Option("--channel", "-c", help="Channel to move.", autocompletion=completion.channels)
+    ] = "production",
+    at: Annotated[
+        str | None,
+        typer.Option("--at", metavar="TIME", help="Move at this time (RFC 3339: 2030-01-31T06:00:00Z), not now."),
+    ] = None,
     ready: Annotated[
         float | None,
-        typer.Option("--ready", metavar="SHARE", help="Move when this share of its online robots has it (0.9)."),
+        typer.Option(
+            "--ready", metavar="SHARE", help="Move when this share of its online robots has the version (0.9)."
+        ),
     ] = None,
     failed: Annotated[
         float | None,
         typer.Option(
-            "--failed", metavar="SHARE", help="Move back, or do not move, when this share of its robots fails (0.2)."
+            "--failed", metavar="SHARE", help="Do not move, or move back, if this share of its robots fails (0.2)."
         ),
     ] = None,
     deadline: Annotated[
         str | None,
-        typer.Option("--deadline", metavar="TIME", help="Without enough robots it stays then (needs --ready)."),
+        typer.Option(
+            "--deadline", metavar="TIME", help="Give up at this time if too few robots are ready (needs --ready)."
+        ),
     ] = None,
     window: Annotated[
         float | None,
-        typer.Option("--window", metavar="SECONDS", help="How long robots are watched after the move [default: 600]."),
+        typer.Option("--window", metavar="SECONDS", help="Watch robots for this long after the move [default: 600]."),
     ] = None,
-    cancel: Annotated[bool, typer.Option("--cancel", help="Drop what is planned for the channel.")] = False,
+    cancel: Annotated[bool, typer.Option("--cancel", help="Cancel the planned move of the channel.")] = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Move a channel to a version: roll out, in two stages where you say so, or roll back."""
+    """Move a channel to a version: its robots fetch that map. An older version rolls back.
+
+    With --ready or --failed it moves in two stages: robots fetch the version first and are watched afterwards.
+
+    Example: `fleetmap promote farm 12 --ready 0.9 --failed 0.2`
+    """
     stages = {"ready": ready, "failed": failed, "deadline": deadline, "window": window}
     rollout = {name: value for name, value in stages.items() if value is not None}
     with Client(server, token) as client:
@@ -126,24 +167,29 @@ def promote(
     elif moved["planned"] is None:
         watched = (moved["rollout"] or {}).get("state") == "watching"
         more = ", and moves back where too many robots fail" if watched else ""
-        output.show(f"{environment}: {channel} stands on version {number}{more}")
+        output.show(f"{environment}: {channel} points to version {number}{more}")
     else:
         when = [f"{ready:.4g} of its online robots have it"] if ready is not None else []
         when += [f"it is {at}"] if at else []
-        output.show(f"{environment}: {channel} will stand on version {number} when {' and '.join(when)}")
+        output.show(f"{environment}: {channel} will point to version {number} when {' and '.join(when)}")
 
 
 def revert(
-    environment: Environment,
-    version: Annotated[str, typer.Argument(help="Version number or channel whose content is wanted back.")],
+    environment: options.Environment,
+    version: Annotated[
+        str,
+        typer.Argument(
+            help="Version number or channel with the content to return to.", autocompletion=completion.versions
+        ),
+    ],
     message: options.Message = "",
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Make a new version with an old one's content.
+    """Create a new version with the content of an old one. Nothing is deleted.
 
-    Nothing is deleted.
+    Example: `fleetmap revert farm 11 -m 'the survey was wrong'`
     """
     with Client(server, token) as client:
         number = resolve(client, environment, version)
@@ -185,7 +231,7 @@ def summary(changes: Mapping[str, Any]) -> str:
 def change_line(what: str, change: Any) -> str:
     """What changed and how: ``topology: 2 added``, ``datum: none → 53.25, -0.5``."""
     if what == "datum" and isinstance(change, Mapping):
-        return f"datum: {_datum(change.get('from'))} → {_datum(change.get('to'))}"
+        return f"datum: {output.datum(change.get('from'))} → {output.datum(change.get('to'))}"
     if what == "templates" and isinstance(change, Mapping):
         return f"templates: {', '.join(_template_changes(change))}"
     if what == "renewed" and isinstance(change, list):
@@ -241,19 +287,6 @@ def _template_changes(change: Mapping[str, Any]) -> list[str]:
     return out
 
 
-def _environments(limit: int, server: str | None, token: str | None, *, as_json: bool) -> None:
-    """All environments that the token may see, by name."""
-    with Client(server, token) as client:
-        rows = list(client.pages("/environments", {"limit": min(limit, 100)}, limit=limit))
-    if as_json:
-        output.show_json(rows)
-        return
-    output.show_table(
-        ("environment", "version", "changed (UTC)", "title"),
-        ((row["name"], row["version"], _minute(row.get("updated")), row.get("title")) for row in rows),
-    )
-
-
 def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
     """What the named server can compute, or where none is named, or none answers, what any can."""
     named = server or os.environ.get("FLEETMAP_SERVER")
@@ -268,28 +301,23 @@ def _derivations(server: str | None, token: str | None) -> list[dict[str, Any]]:
                 raise
             why = str(refused)
     local.require_server_python("derive")
-    from app.api.derivations import as_dict
-    from app.derive import all_derivations
+    from app.catalogue import describe_derivations
 
-    output.say(f"{why}: a server with a provider of pictures has location_to_imagery, too")
-    return [as_dict(d) for d in all_derivations().values()]
-
-
-def _minute(time: Any) -> str:
-    """RFC 3339 as the API tells it (UTC), to the minute: ``2026-05-01 08:30``."""
-    return str(time or "")[:16].replace("T", " ")
-
-
-def _datum(datum: Any) -> str:
-    if not isinstance(datum, Mapping):
-        return "none"
-    heading = datum.get("heading")
-    return f"{datum.get('latitude')}, {datum.get('longitude')}{f', heading {heading:g}°' if heading else ''}"
+    output.say(f"{why}: a server with a provider of satellite pictures also has location_to_imagery")
+    return describe_derivations()
 
 
 def derive(
-    environment: Annotated[str | None, typer.Argument(help="Name of the environment [default: list methods].")] = None,
-    method: Annotated[str | None, typer.Argument(help="The derivation, such as occupancy_to_topology.")] = None,
+    environment: Annotated[
+        str | None,
+        typer.Argument(
+            help="Name of the environment [default: list derivations].", autocompletion=completion.environments
+        ),
+    ] = None,
+    method: Annotated[
+        str | None,
+        typer.Argument(help="Derivation, such as occupancy_to_topology.", autocompletion=completion.derivations),
+    ] = None,
     option: Annotated[list[str] | None, options.named_values("A parameter of the derivation")] = None,
     message: options.Message = "",
     replace: options.Replace = False,
@@ -297,9 +325,11 @@ def derive(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Compute a layer from others and keep it as a version; without names, list the ways.
+    """Compute a layer from other layers and store it as a version. Without names, list the derivations.
 
-    The list is the server's, where one is named (by --server or FLEETMAP_SERVER) and answers; else it needs none.
+    The list comes from the server if you name one (--server or FLEETMAP_SERVER); otherwise it needs none.
+
+    Example: `fleetmap derive farm occupancy_to_topology -O robot_radius=0.3`
     """
     if environment is None:
         known = _derivations(server, token)

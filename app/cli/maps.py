@@ -4,45 +4,56 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from app.cli import completion, local, options, output, write
 from app.cli import folder as folders
-from app.cli import local, options, output, write
-from app.cli.client import Client, Download, LocalFile, Refused, path_of
+from app.cli.client import Client, Download, LocalFile, path_of
+from app.cli.created import ensured
 from app.cli.history import change_line, channel_rows
 from app.errors import Invalid, NotFound
-from app.model.frame import GROUND, Datum
+from app.model.frame import GROUND
 
-LAYERS = ("location", "objects", "topology", "occupancy", "voxels", "imagery", "zones")
+if TYPE_CHECKING:
+    from app.formats import Format, Needs
 
 
 def import_maps(
     paths: Annotated[list[Path], typer.Argument(metavar="PATH...", help="An environment's folder, or map files.")],
     environment: Annotated[
         str | None,
-        typer.Option("--environment", "-e", help="Name [default: made from the folder's]; created where it is absent."),
+        typer.Option(
+            "--environment",
+            "-e",
+            help="Name of the environment, created if it does not exist [default: made from the folder's name].",
+            autocompletion=completion.environments,
+        ),
     ] = None,
     format: options.Format = None,
     layer: options.Layer = None,
     level: options.Level = GROUND,
     grid: options.Grid = None,
     mode: Annotated[
-        str, typer.Option("--mode", help="replace: a map replaces its like; merge: nothing is deleted.")
+        str, typer.Option("--mode", help="replace: a map replaces what it describes; merge: nothing is deleted.")
     ] = "replace",
     message: options.Message = "",
     datum: options.DatumText = None,
     option: options.Options = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Tell what would change; store nothing.")] = False,
+    create: options.Create = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would change; store nothing.")] = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Upload a folder or files as one version of an environment.
+    """Upload a folder or files as a new version of an environment.
 
-    A folder with config/location, config/metric, config/topological or config/world is an environment_template: its
-    files are taken with their folders, which say what each of them is meant for.
+    A folder with config/location, config/metric, config/topological or config/world is an environment_template: the
+    folder of a file says what the file is meant for. An environment that does not exist is created, and removed again
+    if the upload fails.
+
+    Example: `fleetmap import network.kml --environment farm --layer topology -m 'drawn by hand'`
     """
     where = options.datum(datum)
     extra = options.pairs(option)
@@ -56,13 +67,16 @@ def import_maps(
     fields |= {k: v for k, v in (("format", format), ("layer", layer), ("grid", grid)) if v is not None}
     fields |= {"dry_run": "true"} if dry_run else {}
     with Client(server, token) as client:
-        made = _ensure(client, name, paths, where, dry_run=dry_run)
-        try:
+        title = paths[0].resolve().name if len(paths) == 1 and paths[0].is_dir() else None
+        with ensured(
+            client,
+            name,
+            datum=where,
+            title=title if title != name else None,
+            create=create if environment else True,
+            dry_run=dry_run,
+        ) as made:
             status, body = client.upload(path_of("environments", name, "versions"), files, fields)
-        except Refused as refused:
-            if made:
-                refused.hint = f"{refused.hint}\nThe environment {name} was created and is empty.".strip()
-            raise
     if as_json:
         output.show_json(body)
         return
@@ -72,26 +86,26 @@ def import_maps(
 
 
 def export_map(
-    environment: Annotated[str, typer.Argument(help="Name of the environment.")],
-    format: Annotated[str, typer.Argument(help="Format wanted; `fleetmap formats` lists them.")],
+    environment: options.Environment,
+    format: options.MapFormat,
     to: options.Output = None,
-    version: Annotated[
-        str | None,
-        typer.Option("--version", "-V", help="Number or channel [default: production if there is one, else latest]."),
-    ] = None,
+    version: options.MapVersion = None,
     file: Annotated[str | None, typer.Option("--file", help="Only this file of the map.")] = None,
     option: options.Options = None,
-    derive: Annotated[bool, typer.Option("--derive/--no-derive", help="Derive layers that no source has told.")] = True,
+    derive: options.Derive = True,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Also report what was derived, filled in or dropped on the way.")
+    ] = False,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Get a map in any format that its layers give.
+    """Get the map of an environment in any format, and print the paths that were written.
 
-    What was derived, filled in or dropped on the way is told on standard error.
+    A map of several files becomes a folder if -o names one (`-o out/`), otherwise a ZIP. Without -o it is written
+    here, under the server's name for it.
 
-    A map of several files becomes a folder where -o names one, else a ZIP. Without -o it is written here, under the
-    server's name for it.
+    Example: `fleetmap export farm occupancy_grid -o maps/ -O resolution=0.1`
     """
     if to == "-" and as_json:
         raise typer.BadParameter("--json and -o - both want standard output")
@@ -107,23 +121,21 @@ def export_map(
         output.show_json({"files": written, "report": report})
         return
     for name in written:
-        output.say(f"wrote {name}")
-    show_report(report)
+        output.show(name)
+    if verbose:
+        show_report(report)
 
 
 def link(
-    environment: Annotated[str, typer.Argument(help="Name of the environment.")],
-    format: Annotated[str, typer.Argument(help="Format wanted; `fleetmap formats` lists them.")],
+    environment: options.Environment,
+    format: options.MapFormat,
     file: Annotated[str | None, typer.Argument(help="Only this file of the map [default: the whole map].")] = None,
-    version: Annotated[
-        str | None,
-        typer.Option("--version", "-V", help="Number or channel [default: production if there is one, else latest]."),
-    ] = None,
+    version: options.MapVersion = None,
     seconds: Annotated[
         int | None, typer.Option("--seconds", min=1, help="Life in seconds [default: the server's maximum, 86400].")
     ] = None,
     option: options.Options = None,
-    derive: Annotated[bool, typer.Option("--derive/--no-derive", help="Derive layers that no source has told.")] = True,
+    derive: options.Derive = True,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
@@ -131,6 +143,8 @@ def link(
     """Create a signed link to a map: an address that needs no token until it expires.
 
     The link names the version by number, so it always returns the same bytes. Anyone who has it can read this map.
+
+    Example: `fleetmap link farm tmap2 --seconds 3600`
     """
     parameters: dict[str, str] = options.pairs(option)
     parameters |= {} if derive else {"derive": "false"}
@@ -147,7 +161,12 @@ def link(
 
 def convert(
     paths: Annotated[list[Path], typer.Argument(metavar="IN...", help="Map files, or a folder.", exists=True)],
-    to: Annotated[str, typer.Option("--to", help="Format wanted; `fleetmap formats` lists them.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to", help="Format of the output; `fleetmap formats` lists them.", autocompletion=completion.formats
+        ),
+    ],
     out: Annotated[str, typer.Option("--output", "-o", help="A file, a folder, or - for standard output.")],
     format: options.Format = None,
     layer: options.Layer = None,
@@ -155,17 +174,19 @@ def convert(
     grid: options.Grid = None,
     datum: options.DatumText = None,
     option: options.Options = None,
-    derive: Annotated[bool, typer.Option("--derive/--no-derive", help="Derive layers that no file has told.")] = True,
+    derive: options.Derive = True,
     as_json: options.Json = False,
 ) -> None:
-    """Convert files on this machine: no server, nothing stored.
+    """Convert map files on this machine, without a server.
 
-    A map of several files becomes a folder, or a ZIP where the output's name ends in .zip. Options are the wanted
-    format's, or a derivation's on the way; those that neither knows go to the readers.
+    A map of several files becomes a folder, or a ZIP if the name of the output ends in .zip. -O takes parameters of
+    the output's format, of the derivations on the way, and of the formats of the input.
+
+    Example: `fleetmap convert network.kml --layer topology --to tmap2 -o network.tmap2.yaml`
     """
     local.require_server_python("convert")
     from app import formats, parameters
-    from app.bundle import Hints
+    from app.bundle import Hints, drawn_layer
     from app.convert import offline
     from app.derive import all_derivations, takes
 
@@ -176,7 +197,7 @@ def convert(
     ours |= {name for step in all_derivations() for name in takes(step)}
     values = options.pairs(option)
     files, _, notes = _collect(paths)
-    hints = Hints(format, _layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})
+    hints = Hints(format, drawn_layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})
     wanted = {k: v for k, v in values.items() if k in ours}
     with output.progress_bar(f"converting to {to}"):
         data = {f.name: f.path.read_bytes() for f in files}
@@ -198,10 +219,12 @@ def check(
     format: options.Format = None,
     as_json: options.Json = False,
 ) -> None:
-    """Tell what the robots and tools that load these files would refuse or not like.
+    """Check whether the robots and tools that load these files would accept them.
 
-    The rules are those of each format's own loaders (Nav2's map_server, its route server, …); nothing is uploaded or
-    changed. The exit status is 1 where a map would be refused.
+    The rules are those of each format's own loaders (Nav2's map_server, its route server, …). Nothing is uploaded or
+    changed. The exit status is 1 if a map would be refused.
+
+    Example: `fleetmap check map.yaml map.pgm`
     """
     local.require_server_python("check")
     from app import bundle, formats
@@ -229,16 +252,32 @@ def check(
         raise typer.Exit(1)
 
 
-def list_formats(as_json: options.Json = False) -> None:
-    """What can be read and served, with options.
+def list_formats(
+    format: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[FORMAT]",
+            help="One format: its files, layers and parameters [default: list all formats].",
+            autocompletion=completion.formats,
+        ),
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
+    """List the formats that can be read and written, or describe one with its parameters.
 
     Needs no server.
+
+    Example: `fleetmap formats occupancy_grid`
     """
     local.require_server_python("formats")
-    from app import formats
-    from app.api.formats import as_dict
+    from app import catalogue, formats
 
-    known = [as_dict(f) for f in formats.all_formats().values()]
+    if format is not None:
+        found = formats.get_format(format)
+        described = catalogue.describe_format(found)
+        output.show_json(described) if as_json else _show_format(found, described)
+        return
+    known = catalogue.describe_formats()
     if as_json:
         output.show_json(known)
         return
@@ -256,19 +295,70 @@ def list_formats(as_json: options.Json = False) -> None:
     output.show_table(("format", "what it is", "read", "served as", "layers", "options"), rows)
 
 
+def _show_format(known: Format, described: Mapping[str, Any]) -> None:
+    """Describe a format: files, the layers that it keeps and drops, what a map of it needs, and its parameters."""
+    kept = [layer for layer in described["information"] if layer in known.carries]
+    dropped = [layer for layer in described["information"] if layer not in known.carries]
+    dropped += ["blocked edges"] if "topology" in known.carries and not known.marks_blocked else []
+    derived = [layer for layer, how in described["information"].items() if how == "derived"]
+    output.show_members(
+        {
+            "format": f"{known.name}: {known.title}",
+            "uploads": "yes, detected from the content" if known.read else "not read",
+            "maps": ", ".join(known.files) if known.write else "not written",
+            "media types": ", ".join(dict.fromkeys(known.media_types)) if known.write else "",
+            "a map needs": _needed(known.needs) if known.write else "",
+            "keeps": ", ".join(kept),
+            "derived from it": ", ".join(derived) if known.read else "",
+            "has no place for": ", ".join(dropped) if known.write else "",
+        }
+    )
+    for use, title in (("write", "Parameters of a map"), ("read", "Parameters of an upload")):
+        rows = [_parameter_row(p) for p in described["options"] if p["for"] == use]
+        if rows:
+            output.show("")
+            output.show_table(
+                ("parameter", "value", "unit", "default", "meaning"), rows, title=f"{title} (-O NAME=VALUE)"
+            )
+
+
+def _needed(needs: Needs) -> str:
+    """Format what a map needs: ``objects, or occupancy; and a datum``."""
+    layers = ", or ".join(" with ".join(sorted(layers)) for layers in needs.one_of)
+    datum = "a datum" if needs.datum else "a datum, if any content is in metres" if needs.anchor == "wgs84" else ""
+    return "; and ".join(filter(None, (layers, datum)))
+
+
+def _parameter_row(parameter: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
+    """Format a described parameter as a row: name, accepted values, unit, default, meaning."""
+    schema, default = parameter["schema"], parameter["default"]
+    low, high = schema.get("minimum"), schema.get("maximum")
+    kind = {"boolean": "true or false", "integer": "whole number", "number": "number", "string": "text"}[schema["type"]]
+    kind = schema.get("description") or kind
+    if schema.get("enum"):
+        value = ", ".join(schema["enum"])
+    elif low is not None and high is not None:
+        value = f"{kind}, {low:g} to {high:g}"
+    else:
+        value = kind
+    text = ",".join(map(str, default)) if isinstance(default, tuple) else "" if default is None else str(default)
+    meaning, _, unit = parameter["description"].removesuffix("]").partition(" [")
+    return parameter["name"], value, unit, text.lower() if isinstance(default, bool) else text, meaning
+
+
 def coverage(
-    environment: Annotated[str, typer.Argument(help="Name of the environment.")],
+    environment: options.Environment,
     version: options.Version = "latest",
     picture: Annotated[
-        str | None, typer.Option("--picture", help="Write an SVG picture of which file makes which map.")
+        str | None, typer.Option("--picture", help="Write an SVG picture of which file makes which map to this path.")
     ] = None,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Which formats an environment can be had in.
+    """List the formats that an environment can be exported in: directly, by deriving layers, or what is missing.
 
-    Directly, by deriving, or not yet: then with what to supply.
+    Example: `fleetmap coverage farm`
     """
     if picture is not None:
         with Client(server, token) as client:
@@ -333,26 +423,6 @@ def _collect(paths: Sequence[Path]) -> tuple[list[LocalFile], str | None, tuple[
     if twice:
         raise Invalid(f"two of the files are called {twice[0]}: import their folder, or one after the other")
     return files, None, tuple(notes)
-
-
-def _ensure(client: Client, name: str, paths: Sequence[Path], datum: Datum | None, *, dry_run: bool) -> bool:
-    """Make sure that the environment is there and has the datum that was asked for: whether it was made now."""
-    try:
-        known = client.get(path_of("environments", name))
-    except Refused as refused:
-        if refused.status != 404:
-            raise
-        if dry_run:
-            detail = f"there is no environment {name} yet, and a dry run does not create it"
-            raise Refused({"title": "No such environment", "detail": detail}, status=404) from refused
-        title = paths[0].resolve().name if len(paths) == 1 and paths[0].is_dir() else ""
-        body: dict[str, Any] = {"name": name, "title": title if title != name else None}
-        body["datum"] = datum.as_dict() if datum else None
-        client.post("/environments", body)
-        return True
-    if datum is not None and (known.get("datum") or {}) != datum.as_dict() and not dry_run:
-        client.patch(path_of("environments", name), {"datum": datum.as_dict()})
-    return False
 
 
 def _default_message(paths: Sequence[Path]) -> str:
@@ -431,9 +501,3 @@ def _step(step: Any) -> str:
         return name
     start = step["from"] if isinstance(step["from"], str) else " and ".join(step["from"])
     return f"{start} to {step['to']} ({name})"
-
-
-def _layer(text: str | None) -> Any:
-    if text is not None and text not in LAYERS:
-        raise Invalid(f"--layer must be objects, topology, location or zones, got {text!r}")
-    return text

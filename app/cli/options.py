@@ -6,45 +6,112 @@ from typing import Annotated, Any
 
 import typer
 
+from app.cli import completion
 from app.errors import Invalid
 from app.model.frame import Datum
 
+CONNECTION = "Server and output"
+"""Panel of the help with the options that most commands share."""
+
 
 def named_values(help: str) -> Any:
-    """The option -O NAME=VALUE, which ``pairs`` reads."""
+    """Declare the option -O NAME=VALUE, which ``pairs`` reads."""
     return typer.Option("--option", "-O", metavar="NAME=VALUE", help=f"{help}; repeatable.")
 
 
-Options = Annotated[list[str] | None, named_values("A parameter of the format")]
+Options = Annotated[list[str] | None, named_values("A parameter of the format; `fleetmap formats FORMAT` lists them")]
 Server = Annotated[
     str | None,
     typer.Option(
-        "--server", "-s", envvar="FLEETMAP_SERVER", help="Address of the server [default: http://127.0.0.1:8000]."
+        "--server",
+        "-s",
+        envvar="FLEETMAP_SERVER",
+        metavar="URL",
+        help="Address of the server [default: http://127.0.0.1:8000].",
+        rich_help_panel=CONNECTION,
     ),
 ]
 Token = Annotated[
-    str | None, typer.Option("--token", "-t", envvar="FLEETMAP_TOKEN", help="Access token.", show_envvar=True)
+    str | None,
+    typer.Option(
+        "--token",
+        "-t",
+        envvar="FLEETMAP_TOKEN",
+        metavar="TEXT",
+        help="Access token.",
+        rich_help_panel=CONNECTION,
+    ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON.")]
-Version = Annotated[str, typer.Option("--version", "-V", help="Version number, channel, or latest.")]
-Message = Annotated[str, typer.Option("--message", "-m", help="Why, for the history.")]
-Replace = Annotated[bool, typer.Option("--replace", help="Also in place of what a source has told.")]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print machine-readable JSON instead of text.", rich_help_panel=CONNECTION)
+]
+Environment = Annotated[
+    str, typer.Argument(help="Name of the environment.", autocompletion=completion.environments, show_default=False)
+]
+MapFormat = Annotated[
+    str,
+    typer.Argument(help="Format of the map; `fleetmap formats` lists them.", autocompletion=completion.formats),
+]
+Version = Annotated[
+    str,
+    typer.Option("--version", "-V", help="Version number, channel, or latest.", autocompletion=completion.versions),
+]
+MapVersion = Annotated[
+    str | None,
+    typer.Option(
+        "--version",
+        "-V",
+        help="Version number or channel [default: production if it exists, else latest].",
+        autocompletion=completion.versions,
+    ),
+]
+Derive = Annotated[
+    bool, typer.Option("--derive/--no-derive", help="Compute layers that the map needs and no source contains.")
+]
+Message = Annotated[str, typer.Option("--message", "-m", help="Reason, for the history.", show_default=False)]
+Replace = Annotated[bool, typer.Option("--replace", help="Also replace what was uploaded or edited.")]
 Format = Annotated[
-    str | None, typer.Option("--format", "-f", help="Format of the files [default: found out from the content].")
+    str | None,
+    typer.Option(
+        "--format",
+        "-f",
+        help="Format of the files [default: detected from their content].",
+        autocompletion=completion.formats,
+    ),
 ]
 Layer = Annotated[
     str | None,
-    typer.Option("--layer", help="What the lines and polygons of a drawing are: objects, topology, location or zones."),
+    typer.Option(
+        "--layer",
+        help="Meaning of the lines and polygons in a drawing: objects, topology, location or zones.",
+        autocompletion=completion.drawn_layers,
+    ),
 ]
-Level = Annotated[str, typer.Option("--level", help="The storey that the map belongs to.")]
-Grid = Annotated[str | None, typer.Option("--grid", help="Name of the occupancy grid: map, keepout, speed …")]
+Level = Annotated[
+    str, typer.Option("--level", help="Level (storey) that the map belongs to.", autocompletion=completion.levels)
+]
+Grid = Annotated[
+    str | None,
+    typer.Option("--grid", help="Name of the occupancy grid: map, keepout, speed, …", autocompletion=completion.grids),
+]
 DatumText = Annotated[
     str | None,
     typer.Option(
-        "--datum", metavar="LAT,LON[,HEADING]", help="Where the local origin is: degrees; heading clockwise from north."
+        "--datum",
+        metavar="LAT,LON[,HEADING]",
+        help="Position of the local origin in degrees; heading clockwise from north.",
     ),
 ]
-Output = Annotated[str | None, typer.Option("--output", "-o", help="A file, a folder, or - for standard output.")]
+Output = Annotated[str | None, typer.Option("--output", "-o", help="File, folder, or - for standard output.")]
+Create = Annotated[
+    bool | None,
+    typer.Option(
+        "--create/--no-create",
+        help="Create an environment that does not exist, or refuse to "
+        "[default: create, unless the name looks like a slip in that of an existing one].",
+        show_default=False,
+    ),
+]
 
 
 def pairs(texts: list[str] | None) -> dict[str, str]:

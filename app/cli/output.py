@@ -73,6 +73,27 @@ def show_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], *, title: 
     console.print(table)
 
 
+def show_members(members: Mapping[str, Any]) -> None:
+    """Print what one thing is: a line for each member that has a value."""
+    width = max((len(name) for name in members), default=0)
+    for name, value in members.items():
+        if value not in (None, "", [], {}):
+            show(f"{name.ljust(width)}  {value}")
+
+
+def minute(time: Any) -> str:
+    """Shorten an RFC 3339 time of the API (UTC) to the minute: ``2026-05-01 08:30``."""
+    return str(time or "")[:16].replace("T", " ")
+
+
+def datum(datum: Any) -> str:
+    """Format a datum for people: ``53.25, -0.5, heading 12.5°``."""
+    if not isinstance(datum, Mapping):
+        return "none"
+    heading = datum.get("heading")
+    return f"{datum.get('latitude')}, {datum.get('longitude')}{f', heading {heading:g}°' if heading else ''}"
+
+
 def _widths(columns: Sequence[Sequence[str]], room: int) -> list[int]:
     """How wide each column of a table is, in characters of a terminal with ``room`` of them.
 

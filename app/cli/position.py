@@ -18,9 +18,11 @@ def locate(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the environments that a position is in, best match first.
+    """List the environments that a position is in, best match first: which map am I on?
 
-    GNSS fences come first, then the smallest area. Exits with status 1 if there is no such environment.
+    GNSS fences come first, then the smallest area. The exit status is 1 if there is no such environment.
+
+    Example: `fleetmap where 53.2690,-0.5238`
     """
     with Client(server, token) as client:
         rows = list(client.pages("/environments", {"contains": position}))

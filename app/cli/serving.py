@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import multiprocessing
 import os
+import re
 import secrets
 import signal
 import socket
@@ -14,19 +15,22 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import typer
 
-from app.cli import local, options, output
-from app.cli.client import Client, Refused
+from app.cli import local, options, output, variables
+from app.cli.client import Client
+from app.cli.problems import Refused
 from app.errors import FleetMapError, Unavailable
 
 if TYPE_CHECKING:
     from app.config import Settings
+
+_ASSIGNED = re.compile(rf"\s*(?:export\s+)?({variables.PREFIX}\w+)\s*=", re.IGNORECASE)
 
 SECRETS_DIR = "FLEETMAP_SECRETS_DIR"
 """Names the folder where a container mounts secrets: a file named like a setting (``fleetmap_admin_token``) holds its
@@ -34,6 +38,16 @@ value. It is no setting itself, since it says where settings are."""
 
 START_SECONDS = 60.0
 """How long the demo waits for the server to be ready."""
+
+PANELS: Mapping[str, str] = {
+    **dict.fromkeys(("data", "database", "blob", "cache", "memory"), "Data"),
+    **dict.fromkeys(("host", "port", "tls", "admin", "insecure", "token", "header", "body"), "Network and access"),
+    "zenoh": "Events over Zenoh",
+    "ros2": "Maps as ROS 2 topics",
+    **dict.fromkeys(("imagery", "models"), "Satellite pictures and models"),
+    "max": "Limits of uploads and maps",
+}
+"""Panels of the help by the first word of a setting; the others are in the first panel."""
 
 NOT_FLAGS = frozenset({"admin_token", "zenoh_password"})
 """Settings that must not stand in a command line, where every user of the machine can read them."""
@@ -43,12 +57,14 @@ DEMO_TOKEN = "demo-token"  # noqa: S105  the name of a file
 
 
 def serve(*, demo: bool = False, **values: Any) -> None:
-    """Start the server.
+    """Start the server, with a demo if you like.
 
     It runs in the foreground and stops cleanly on SIGTERM and Ctrl-C.
 
     Every option is also a setting: FLEETMAP_… in the environment or in a file .env, or a file fleetmap_… in the folder
-    that FLEETMAP_SECRETS_DIR names.
+    that FLEETMAP_SECRETS_DIR names. Sizes are bytes, or have a unit: 512MiB, 2GB.
+
+    Example: `fleetmap serve --port 8080 --data-dir /srv/fleetmap --max-upload-bytes 2GiB`
     """
     settings = load_settings(values)
     if demo and settings.tls_certificate is not None:
@@ -92,16 +108,18 @@ def _compile(folder: Path) -> None:
 
 def migrate(
     database_url: Annotated[
-        str | None, typer.Option("--database-url", help="The database [default: FLEETMAP_DATABASE_URL].")
+        str | None, typer.Option("--database-url", help="Database [default: FLEETMAP_DATABASE_URL].")
     ] = None,
     data_dir: Annotated[
-        Path | None, typer.Option("--data-dir", help="The server's folder [default: FLEETMAP_DATA_DIR].")
+        Path | None, typer.Option("--data-dir", help="Data folder of the server [default: FLEETMAP_DATA_DIR].")
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Bring the database to this release's schema.
+    """Migrate the database to the schema of this release.
 
-    PostgreSQL needs it before the server of a new release starts; SQLite is brought up at each start anyway.
+    PostgreSQL needs it before the server of a new release starts. SQLite is migrated at each start anyway.
+
+    Example: `fleetmap migrate --database-url postgresql+psycopg://fleetmap@db/fleetmap`
     """
     local.require_server_python("migrate")
     settings = load_settings({"database_url": database_url, "data_dir": data_dir})
@@ -115,9 +133,9 @@ def migrate(
 
 
 def demo(server: options.Server = None, token: options.Token = None, as_json: options.Json = False) -> None:
-    """Put the demo environment on a running server.
+    """Install the demo environment on a running server. A second time changes nothing.
 
-    Doing it again changes nothing.
+    Example: `fleetmap demo`
     """
     from app.cli import demo as orchard
 
@@ -137,11 +155,15 @@ def application() -> Any:
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    return _main().create_app(load_settings({}))
+    return _main().create_app(load_settings({}, warn=False))  # the process that started it has warned
 
 
-def load_settings(values: Mapping[str, Any]) -> Settings:
-    """The settings: flags first, then the environment, ``.env``, mounted secrets. BadParameter for unusable ones."""
+def load_settings(values: Mapping[str, Any], *, warn: bool = True) -> Settings:
+    """The settings: flags first, then the environment, ``.env``, mounted secrets. BadParameter for unusable ones.
+
+    Args:
+        warn: whether FLEETMAP_ variables that nothing reads are warned of.
+    """
     local.require_server_python("serve")
     from pydantic import ValidationError
 
@@ -153,6 +175,8 @@ def load_settings(values: Mapping[str, Any]) -> Settings:
         if not Path(folder).is_dir():
             raise typer.BadParameter(f"{SECRETS_DIR}: there is no folder {folder}")
         given["_secrets_dir"] = folder
+    if warn:
+        _warn_unknown(Settings.model_fields, Path(".env"))
     try:
         return Settings(**given)
     except ValidationError as error:
@@ -165,27 +189,42 @@ def load_settings(values: Mapping[str, Any]) -> Settings:
         raise typer.BadParameter("; ".join(reasons)) from error
 
 
+def _warn_unknown(settings: Iterable[str], file: Path) -> None:
+    """Warn of FLEETMAP_ variables, in the environment or a .env file, that nothing reads."""
+    names = dict.fromkeys(name.upper() for name in os.environ if name.upper().startswith(variables.PREFIX))
+    if file.is_file():
+        lines = file.read_text(errors="replace").splitlines()
+        names |= dict.fromkeys(found[1].upper() for line in lines if (found := _ASSIGNED.match(line)))
+    known = {f"{variables.PREFIX}{name.upper()}" for name in settings} | {SECRETS_DIR}
+    for warning in variables.unknown(names, known):
+        output.say(f"warning: {warning}", style="yellow")
+
+
 def with_flags(function: Callable[..., None]) -> Callable[..., None]:
     """``serve`` with an option for every setting, as ``app.config.Settings`` declares them."""
     local.require_server_python("serve")
-    from app.config import Settings
+    from app.config import Settings, format_size
 
     def command(**values: Any) -> None:
         function(**values)
 
-    demo = Annotated[bool, typer.Option("--demo", help="Bring a small demo environment along, and commands to try.")]
+    demo = Annotated[bool, typer.Option("--demo", help="Install a small demo environment, and print commands to try.")]
     parameters: dict[str, tuple[Any, bool | None]] = {"demo": (demo, False)}
     for name, field in Settings.model_fields.items():
         if name in NOT_FLAGS:
             continue
         flag = f"--{name.replace('_', '-')}"
-        default = None if field.default_factory or field.default is None else field.default
-        note = "" if default is None or default is False else f" [default: {default}]"
-        text = f"{(field.description or '').replace('`', '')}{note}"
+        default = None if field.default_factory or field.default in ("", False) else field.default
+        sized = name.endswith("_bytes")
+        note = "" if default is None else f" [default: {format_size(default) if sized else default}]"
+        text = f"{field.description or ''}{note}"
+        panel = PANELS.get(name.partition("_")[0])
         if field.annotation is bool:
-            parameters[name] = (Annotated[bool, typer.Option(flag, help=text)], False)
-        else:
-            parameters[name] = (Annotated[str | None, typer.Option(flag, help=text, show_default=False)], None)
+            parameters[name] = (Annotated[bool, typer.Option(flag, help=text, rich_help_panel=panel)], False)
+            continue
+        shown = "SIZE" if sized else "SECONDS" if name.endswith("_seconds") else _metavar(field.annotation)
+        option = typer.Option(flag, help=text, show_default=False, metavar=shown, rich_help_panel=panel)
+        parameters[name] = (Annotated[str | None, option], None)
     keyword = inspect.Parameter.KEYWORD_ONLY
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [inspect.Parameter(n, keyword, default=d, annotation=a) for n, (a, d) in parameters.items()]
@@ -193,6 +232,14 @@ def with_flags(function: Callable[..., None]) -> Callable[..., None]:
     command.__annotations__ = {name: annotation for name, (annotation, _) in parameters.items()}
     command.__doc__ = function.__doc__
     return command
+
+
+def _metavar(annotation: Any) -> str:
+    """Return the word for a setting's value in the help: its choices, or its kind."""
+    if get_origin(annotation) is Literal:
+        return "|".join(get_args(annotation))
+    kinds = {int: "NUMBER", float: "NUMBER", Path: "PATH"}
+    return next((kinds[kind] for kind in (annotation, *get_args(annotation)) if kind in kinds), "TEXT")
 
 
 def listen(host: str, port: int) -> socket.socket:

@@ -8,32 +8,42 @@ from typing import Annotated, Any
 
 import typer
 
-from app.cli import local, options, output
+from app.cli import completion, local, options, output
 from app.cli.client import Client, path_of
 from app.cli.history import change_line
 
 
 def template(
-    environment: Annotated[str | None, typer.Argument(help="Name of the environment [default: list the sets].")] = None,
-    format: Annotated[str | None, typer.Argument(help="One format; without it the environment as a whole.")] = None,
-    chosen: Annotated[
-        str | None, typer.Option("--set", metavar="NAME", help="The set that holds: of the environment, or the format.")
+    environment: Annotated[
+        str | None,
+        typer.Argument(
+            help="Name of the environment [default: list the template sets].", autocompletion=completion.environments
+        ),
     ] = None,
-    option: Annotated[list[str] | None, options.named_values("A value of the format's parameter")] = None,
+    format: Annotated[
+        str | None, typer.Argument(help="Only for this format [default: all].", autocompletion=completion.formats)
+    ] = None,
+    chosen: Annotated[
+        str | None,
+        typer.Option("--set", metavar="NAME", help="Use this template set, for the environment or the format."),
+    ] = None,
+    option: Annotated[list[str] | None, options.named_values("A value for a parameter of the format")] = None,
     unset: Annotated[
-        bool, typer.Option("--unset", help="Take back what was said; with -O NAME only this parameter.")
+        bool, typer.Option("--unset", help="Return to the defaults; with -O NAME only for this parameter.")
     ] = False,
     message: options.Message = "",
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Tell what would change; store nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would change; store nothing.")] = False,
     version: options.Version = "latest",
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """What is filled in where a format asks for more than the layers have.
+    """Show or set the values that are filled in where a format needs more than the layers contain.
 
-    Without --set, --option or --unset it is shown, and where it comes from: the environment itself, its template set,
-    or the format's own default. A change is a version: robots get other maps by it.
+    Each value comes from the environment, from its template set, or from the default of the format. A change makes
+    a version, since robots get other maps.
+
+    Example: `fleetmap template farm tmap2 -O xy_goal_tolerance=0.4`
     """
     if environment is None:
         _sets(as_json=as_json)

@@ -8,27 +8,42 @@ import typer
 
 from app.cli import options, output
 from app.cli.client import Client, path_of
+from app.cli.groups import Commands
+from app.model.names import did_you_mean
 
-commands = typer.Typer(no_args_is_help=True, help="Create, list and delete access tokens (as administrator).")
+commands = Commands("Create, list and delete access tokens (as administrator).")
+
+
+ROLES = ("viewer", "robot", "editor", "admin")
 
 
 @commands.command("create")
 def create(
-    name: Annotated[str, typer.Argument(help="Whose it is, for the list.")],
-    role: Annotated[str, typer.Option("--role", "-r", help="viewer, robot, editor or admin.")] = "viewer",
+    name: Annotated[str, typer.Argument(help="Name of its owner: it is the author in the history.")],
+    role: Annotated[
+        str, typer.Option("--role", "-r", help="viewer, robot, editor or admin.", autocompletion=lambda: list(ROLES))
+    ] = "viewer",
     environments: Annotated[
-        str | None, typer.Option("--environments", "-e", help="Only environments of this name pattern: 'farm-*'.")
+        str | None,
+        typer.Option("--environments", "-e", help="Only environments with names like this: 'farm-*' [default: all]."),
     ] = None,
     robot: Annotated[
         str | None,
-        typer.Option("--robot", help="The robot whose status it may set (role robot) [default: the token's name]."),
+        typer.Option("--robot", help="Robot whose status it may report (role robot) [default: NAME]."),
     ] = None,
-    expires: Annotated[str | None, typer.Option("--expires", metavar="TIME", help="Until when (RFC 3339).")] = None,
+    expires: Annotated[
+        str | None, typer.Option("--expires", metavar="TIME", help="End of its life (RFC 3339) [default: none].")
+    ] = None,
     server: options.Server = None,
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Make a token. It is shown this once: the server keeps only its hash."""
+    """Create a token. It is printed only now: the server stores only its hash.
+
+    Example: `fleetmap token create tractor-7 --role robot --environments 'farm-*'`
+    """
+    if role not in ROLES:
+        raise typer.BadParameter(f"--role is one of {', '.join(ROLES)}{did_you_mean(role, ROLES)}")
     body = {"name": name, "role": role, "environments": environments, "robot": robot, "expires": expires}
     with Client(server, token) as client:
         made = client.post("/tokens", body)
@@ -42,7 +57,10 @@ def create(
 
 @commands.command("list")
 def show(server: options.Server = None, token: options.Token = None, as_json: options.Json = False) -> None:
-    """All tokens, without their texts."""
+    """List all tokens, without their secrets.
+
+    Example: `fleetmap token list`
+    """
     with Client(server, token) as client:
         rows = list(client.pages("/tokens", {}))
     if as_json:
@@ -59,7 +77,10 @@ def delete(
     token: options.Token = None,
     as_json: options.Json = False,
 ) -> None:
-    """Make a token useless from now on."""
+    """Delete a token: it is refused from now on.
+
+    Example: `fleetmap token delete 3f9a…`
+    """
     with Client(server, token) as client:
         client.delete(path_of("tokens", identifier))
     if as_json:

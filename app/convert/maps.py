@@ -35,6 +35,7 @@ from app.errors import (
 from app.formats import Limits, _shell, environment
 from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
+from app.model.names import did_you_mean
 from app.pool import Stop, WorkerDied
 from app.store import Store
 from app.store.values import Version
@@ -415,8 +416,9 @@ def file_of(recipe: Recipe, made: Made, file: str | None) -> MadeFile:
         others = [f for f in made.files if f.name.rpartition("/")[2] == wanted]
         found = others[0] if len(others) == 1 else None  # on the only level that has it
     if found is None:
-        names = ", ".join(f.name for f in made.files[:20]) or "none"
-        raise NotFound(f"this map has no file {file!r}; its files are: {names}")
+        names = [f.name for f in made.files]
+        near = did_you_mean(file, names)
+        raise NotFound(f"this map has no file {file!r}{near}; its files are: {', '.join(names[:20]) or 'none'}")
     return found
 
 

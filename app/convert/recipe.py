@@ -21,6 +21,7 @@ from app.errors import Ambiguous, CannotConvert, Invalid, MissingDatum, MissingL
 from app.formats import Format
 from app.model.features import Features
 from app.model.layers import LAYERS, MAP, Layer, Layers, PartKey
+from app.model.names import did_you_mean
 from app.model.templates import Templates
 from app.store.values import PartEntry, Version
 
@@ -296,8 +297,9 @@ def _forced(
     own = [p["name"] for p in parameters.describe(known.write_options)]
     accepted = ", ".join(own) or "none"
     further = f"; where a layer is derived, also {', '.join(told)}" if told else ""
-    problem = f"no such parameter of {known.name} here; accepted: {accepted}{further}"
     wrong = sorted(names)
+    near = did_you_mean(wrong[0], [*own, *told])
+    problem = f"no such parameter of {known.name} here{near}; accepted: {accepted}{further}"
     raise Invalid(f"{', '.join(wrong)}: {problem}", [Problem(problem, where=name) for name in wrong])
 
 

@@ -7,6 +7,7 @@ from typing import TypeVar
 
 from app.errors import Ambiguous, NotFound
 from app.model.layers import PartKey
+from app.model.names import did_you_mean
 
 P = TypeVar("P")
 
@@ -15,8 +16,9 @@ def named(parts: Mapping[PartKey, P], name: str, what: str) -> dict[PartKey, P]:
     """The parts of this name. what: what errors call one. Raises NotFound with the names that there are."""
     found = {key: part for key, part in parts.items() if key.name == name}
     if not found:
-        there = ", ".join(sorted({key.name for key in parts})) or "none"
-        raise NotFound(f"there is no {what} {name!r}; there are: {there}")
+        names = sorted({key.name for key in parts})
+        there = ", ".join(names) or "none"
+        raise NotFound(f"there is no {what} {name!r}{did_you_mean(name, names)}; there are: {there}")
     return found
 
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from app.derive._segments import KINDS
 from app.errors import CannotConvert, NotFound, TooLarge
+from app.model.names import did_you_mean
 
 FOLDER, LARGEST = "FLEETMAP_MODELS_DIR", "FLEETMAP_MODELS_MAX_BYTES"
 MOST_BYTES = 2 * 2**30
@@ -98,7 +99,8 @@ def supplied(name: str) -> Supplied:
         )
     known = _known(Path(folder))
     if not _NAME.fullmatch(name) or name not in known:
-        raise NotFound(f"there is no model {name[:100]!r}; there are: {', '.join(known) or 'none'}")
+        near = did_you_mean(name, known)
+        raise NotFound(f"there is no model {name[:100]!r}{near}; there are: {', '.join(known) or 'none'}")
     files = known[name]
     most = int(os.environ.get(LARGEST) or MOST_BYTES)
     stems = {file.stem for file in files}

@@ -28,6 +28,7 @@ from app.model.features import Features
 from app.model.frame import GROUND, Anchor
 from app.model.geodesy import LocalFrame
 from app.model.layers import MAP, Layer, Layers, PartKey
+from app.model.names import did_you_mean
 
 Files = Mapping[str, bytes]
 """A map as named files: relative path with forward slashes -> content."""
@@ -270,7 +271,7 @@ def get_format(name: str) -> Format:
     """The format of this name; NotFound tells the known ones."""
     known = all_formats()
     if name not in known:
-        raise NotFound(f"there is no format {name!r}; known formats: {', '.join(known)}")
+        raise NotFound(f"there is no format {name!r}{did_you_mean(name, known)}; known formats: {', '.join(known)}")
     return known[name]
 
 

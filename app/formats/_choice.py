@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from app.errors import Ambiguous, MissingLayer, NotFound
 from app.model.frame import GROUND
 from app.model.layers import MAP, Layer, PartKey
+from app.model.names import did_you_mean
 
 
 def file_stem(name: str, usual: str = MAP) -> str:
@@ -39,14 +40,15 @@ def the_one(
     found = [key for key in every if level in (None, key.level)]
     names = sorted({key.name for key in found})
     if not found:
-        levels = ", ".join(sorted({key.level for key in every}))
-        raise NotFound(f"there is no {what} on the level {level!r}; there are {what}s on: {levels}")
+        there = sorted({key.level for key in every})
+        near = did_you_mean(level or "", there)
+        raise NotFound(f"there is no {what} on the level {level!r}{near}; there are {what}s on: {', '.join(there)}")
     name = name or (usual if usual in names else names[0] if len(names) == 1 else None)
     if name is None:
         raise Ambiguous(f"there are several {what}s, name one with {option}=…: {', '.join(names)}")
     found = [key for key in found if key.name == name]
     if not found:
-        raise NotFound(f"there is no {what} {name!r}; there are: {', '.join(names)}")
+        raise NotFound(f"there is no {what} {name!r}{did_you_mean(name, names)}; there are: {', '.join(names)}")
     if len(found) > 1:
         ground = [key for key in found if key.level == GROUND]
         if not ground:

@@ -22,6 +22,7 @@ from app.derive import Notes
 from app.errors import CannotGenerate, Invalid, MissingLayer, NotFound, Problem
 from app.model.frame import Datum
 from app.model.layers import Layer, Layers, PartKey, is_empty
+from app.model.names import did_you_mean
 
 MAX_SEED = 2**63 - 1
 MAX_CELLS = 2**26
@@ -131,10 +132,10 @@ def all_generators() -> Mapping[str, Generator]:
 
 def get_generator(name: str) -> Generator:
     """NotFound, with the known ones, for a name that is none."""
-    known = all_generators().get(name)
-    if known is None:
-        raise NotFound(f"there is no generator {name!r}; known ones: {', '.join(all_generators())}")
-    return known
+    known = all_generators()
+    if name not in known:
+        raise NotFound(f"there is no generator {name!r}{did_you_mean(name, known)}; known ones: {', '.join(known)}")
+    return known[name]
 
 
 def check(name: str, seed: int, values: Mapping[str, Any]) -> tuple[Generator, Any]:

@@ -17,6 +17,7 @@ from app.model import alignment
 from app.model.frame import GROUND
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
+from app.model.names import did_you_mean
 from app.store.changes import Changes, Prepared, Replace
 from app.store.values import Version
 
@@ -65,8 +66,11 @@ def prepare_alignment(database_url: str, blob_dir: str, base: Version, wish: Ali
     target = PartKey("occupancy", wish.onto_level, wish.name)
     entries = {e.key: e for e in base.parts}
     if key not in entries:
-        grids = ", ".join(f"{k.level}/{k.name}" for k in sorted(entries) if k.layer == "occupancy") or "none"
-        raise NotFound(f"there is no grid {wish.level}/{wish.grid}; stored grids: {grids}")
+        stored = [f"{k.level}/{k.name}" for k in sorted(entries) if k.layer == "occupancy"]
+        name = f"{wish.level}/{wish.grid}"
+        raise NotFound(
+            f"there is no grid {name}{did_you_mean(name, stored)}; stored grids: {', '.join(stored) or 'none'}"
+        )
     if not wish.pairs and wish.layer == "occupancy" and key == target:
         reason = "a grid lies on itself already: name another one, a layer (objects, voxels), or pairs of points"
         raise Invalid(reason, [Problem(reason, where="body.onto")])

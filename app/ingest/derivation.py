@@ -11,6 +11,7 @@ from app.derive import Notes, Step
 from app.errors import CannotDerive, Conflict, Invalid, MissingLayer, NotFound, Problem
 from app.ingest.prepare import open_store
 from app.model.layers import MAP, Layer, Layers, PartKey, is_empty
+from app.model.names import did_you_mean
 from app.store.changes import Changes, Prepared, Provenance, Replace
 from app.store.values import PartEntry, Version, frame_line
 
@@ -29,14 +30,16 @@ def check(wish: Wish) -> None:
     """NotFound for an unknown method (with the known ones), Invalid for a parameter that no derivation has."""
     known = derive.all_derivations()
     if wish.method not in known:
-        raise NotFound(f"there is no derivation {wish.method!r}; known ones: {', '.join(known)}")
+        near = did_you_mean(wish.method, known)
+        raise NotFound(f"there is no derivation {wish.method!r}{near}; known ones: {', '.join(known)}")
     own = {n: v for n, v in wish.values.items() if n in derive.takes(wish.method)}
     parameters.parse(known[wish.method].parameters, own, f"parameter of {wish.method}")
     everything = frozenset().union(*(derive.takes(name) for name in known))
     for name in wish.values:
         if name not in everything:
             accepted = ", ".join(sorted(derive.takes(wish.method))) or "none"
-            problem = f"no such parameter of {wish.method}; accepted: {accepted}"
+            near = did_you_mean(name, derive.takes(wish.method))
+            problem = f"no such parameter of {wish.method}{near}; accepted: {accepted}"
             raise Invalid(f"{name}: {problem}", [Problem(problem, where=f"parameters.{name}")])
 
 

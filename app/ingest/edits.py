@@ -24,6 +24,7 @@ from app.model.frame import GROUND, MAX_METRES, Datum, Level
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import NETWORK, SITE, VECTOR_LAYERS, ZONES, Layer, PartKey, join_levels
+from app.model.names import did_you_mean
 from app.store import Store
 from app.store.changes import KEEP, Changes, Delete, Provenance, Put, Replace
 from app.store.values import Version
@@ -424,8 +425,9 @@ class _Session:
         for key in fitting:
             by_name[key.name].append(key)
         if not fitting:
-            known = ", ".join(sorted(k.name for k in self._keys if k.layer == "occupancy")) or "none"
-            raise NotFound(f"there is no grid {name!r}; known grids: {known}")
+            known = sorted(k.name for k in self._keys if k.layer == "occupancy")
+            near = did_you_mean(name or "", known)
+            raise NotFound(f"there is no grid {name!r}{near}; known grids: {', '.join(known) or 'none'}")
         if len(fitting) == 1:
             return fitting[0]
         if name is None and len(by_name["map"]) == 1:

@@ -18,6 +18,9 @@ Layer = Literal["location", "objects", "topology", "occupancy", "voxels", "image
 """The kinds of information, and ``resources``: files that items refer to (meshes, images), kept byte for byte."""
 
 LAYERS: tuple[Layer, ...] = get_args(Layer)
+CONTENT_LAYERS: tuple[Layer, ...] = tuple(layer for layer in LAYERS if layer != "resources")
+"""The seven layers that clients see; ``resources`` are files that objects need."""
+
 VECTOR_LAYERS: frozenset[Layer] = frozenset({"location", "objects", "topology", "zones"})
 
 NETWORK = "network"

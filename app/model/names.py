@@ -1,8 +1,9 @@
-"""Names of files that others have chosen: which of them may be used below a folder."""
+"""Names that others have chosen: which file names are safe below a folder, and what a mistyped name may mean."""
 
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Iterable
 
 MAX_NAME = 1024
 MAX_DEPTH = 64
@@ -27,3 +28,27 @@ def bad_name(name: str) -> str | None:
     if "." in parts or "" in parts:
         return "has an empty or . folder"
     return None
+
+
+NEAR = 0.7
+"""Similarity, 0 to 1, from which a name counts as mistyped for another."""
+
+MAX_COMPARED = 10_000
+"""Names that a mistyped one is compared with."""
+
+
+def nearest(name: str, choices: Iterable[str], *, similarity: float = NEAR) -> str | None:
+    """Return the choice that a mistyped name most probably means, upper and lower case alike."""
+    import difflib  # only for a name that is wrong
+
+    lowered: dict[str, str] = {}
+    for choice in list(choices)[:MAX_COMPARED]:
+        lowered.setdefault(choice.lower(), choice)
+    found = difflib.get_close_matches(name[:MAX_NAME].lower(), lowered, n=1, cutoff=similarity)
+    return lowered[found[0]] if found else None
+
+
+def did_you_mean(name: str, choices: Iterable[str]) -> str:
+    """Return ` (did you mean NAME?)` for an error about an unknown name, or an empty text if none is near."""
+    found = nearest(name, choices)
+    return f" (did you mean {found}?)" if found is not None else ""

@@ -13,6 +13,7 @@ from typing import Any
 
 from app.errors import NotFound
 from app.model.features import Features, Properties
+from app.model.names import did_you_mean
 
 FAMILY = "gazebo"
 
@@ -51,7 +52,9 @@ def chosen(part: Features, wanted: str | None) -> tuple[Features, list[str]]:
     if wanted is not None and known:
         found = [name for name in known if wanted in (name, PurePosixPath(name).name)]
         if not found:
-            raise NotFound(f"there is no world {wanted[:200]!r}; there are: {', '.join(known)}")
+            raise NotFound(
+                f"there is no world {wanted[:200]!r}{did_you_mean(wanted, known)}; there are: {', '.join(known)}"
+            )
         known = [found[0], *(name for name in known if name != found[0])]
     if len(known) < 2:
         return part, []

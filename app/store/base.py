@@ -12,11 +12,12 @@ from sqlalchemy import Connection, Row, select
 
 from app.errors import Gone, Invalid, NotFound, Problem
 from app.model.frame import Datum
+from app.model.names import did_you_mean
 from app.store import tables
 from app.store.blobs import Blobs
 from app.store.chunks import Chunks
 from app.store.database import Database
-from app.store.values import Environment
+from app.store.values import LATEST, Environment
 
 ENVIRONMENT_NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]{0,62}")
 RESERVED: Final = frozenset({"robots", "server"})
@@ -82,6 +83,13 @@ def environment_row(connection: Connection, name: str, *, lock: bool = False, de
     if row.deleted is not None and not deleted:
         raise Gone(f"the environment {name!r} is deleted; POST /api/v1/environments/{name}/restore brings it back")
     return row
+
+
+def nearest_channel(connection: Connection, environment: Row[Any], name: str) -> str:
+    """Return ` (did you mean NAME?)` for an unknown channel, or an empty text if no other is near."""
+    table = tables.channel
+    names = connection.execute(select(table.c.name).where(table.c.environment_id == environment.id)).scalars()
+    return did_you_mean(name, [LATEST, *names])
 
 
 def datum_of(members: dict[str, float] | None) -> Datum | None:

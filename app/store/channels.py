@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Row, insert, select, update
 from app.errors import Invalid, NotFound
 from app.model.closures import ClosureMode, Closures
 from app.store import outbox, tables
-from app.store.base import CHANNEL_NAME, Base, environment_row, text, utcnow
+from app.store.base import CHANNEL_NAME, Base, environment_row, nearest_channel, text, utcnow
 from app.store.manifest import read_version
 from app.store.overlays import closures_in_force
 from app.store.robots import robots_of
@@ -88,7 +88,8 @@ class Channels(Base):
                     )
                 ).one_or_none()
                 if known is None or known.version is None:
-                    raise NotFound(f"{environment} has no channel {ref!r} that stands on a version")
+                    near = nearest_channel(connection, row, ref)
+                    raise NotFound(f"{environment} has no channel {ref!r} that stands on a version{near}")
                 number, sequence = known.version, known.sequence
             found, sequence = read_version(connection, row, number), int(sequence or 0)
             if mode == "ignore":
@@ -264,7 +265,8 @@ def _row(connection: Connection, environment: Row[Any], channel: str) -> Row[Any
 def _read(connection: Connection, environment: Row[Any], channel: str) -> Channel:
     row = _row(connection, environment, channel)
     if row is None:
-        raise NotFound(f"{environment.name} has no channel {channel!r}")
+        near = nearest_channel(connection, environment, channel)
+        raise NotFound(f"{environment.name} has no channel {channel!r}{near}")
     root = None if row.version is None else read_version(connection, environment, row.version).root
     planned = None
     if row.planned_version is not None:

@@ -14,7 +14,7 @@ from app.errors import Problem
 from app.model.closures import NO_CLOSURES, Closure, Closures
 from app.model.features import Features
 from app.model.frame import Datum, Level
-from app.model.layers import LAYERS, Layer, PartKey
+from app.model.layers import CONTENT_LAYERS, PartKey
 from app.model.templates import NO_TEMPLATES, Templates
 
 EDIT = "edit"
@@ -31,9 +31,6 @@ the box crosses the antimeridian."""
 
 Bounds = Mapping[Literal["local", "wgs84"], Box | None]
 """The box of a part's local items in metres and of its wgs84 items in degrees; None where it has none of them."""
-
-INFORMATION_LAYERS: tuple[Layer, ...] = tuple(layer for layer in LAYERS if layer != "resources")
-"""The seven layers that a version tells about."""
 
 LATEST = "latest"
 """The channel that moves by itself: the head."""
@@ -260,7 +257,7 @@ class Version:
         """For each of the seven layers raw, derived, template, generated, or missing; raw beats the others."""
         order = ("raw", "derived", "generated", "template")
         out: dict[str, str] = {}
-        for layer in INFORMATION_LAYERS:
+        for layer in CONTENT_LAYERS:
             kinds = {e.provenance.information for e in self.parts if e.key.layer == layer and e.count}
             if layer == "location" and self.datum is not None and not kinds:
                 kinds = {datum_information(self.datum, self.parts)}

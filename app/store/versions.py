@@ -14,7 +14,7 @@ from app.model.frame import Datum, Level
 from app.model.templates import Templates, template_changes
 from app.store import chunks, index, outbox, tables
 from app.store.area import area_after, put_area
-from app.store.base import Base, clean, clean_problem, environment_row, text, utcnow
+from app.store.base import Base, clean, clean_problem, environment_row, nearest_channel, text, utcnow
 from app.store.changes import KEEP, Changes, Keep, Prepared
 from app.store.extent import extent, geometry
 from app.store.manifest import as_version, pack_manifest, read_sources, read_version
@@ -37,9 +37,10 @@ def resolve(connection: Connection, environment: Row[Any], ref: str | int) -> in
     query = select(table.c.version).where(table.c.environment_id == environment.id, table.c.name == ref)
     found = connection.execute(query).scalar_one_or_none()
     if found is None:
+        near = nearest_channel(connection, environment, ref)
         raise NotFound(
-            f"{environment.name} has no version or channel {ref[:80]!r}: ask for a number, latest, or a channel that "
-            "was set"
+            f"{environment.name} has no version or channel {ref[:80]!r}{near}: ask for a number, latest, or a channel "
+            "that was set"
         )
     return int(found)
 

@@ -365,6 +365,12 @@ def test_work_that_takes_long_becomes_a_job(tmp_path: Path, monkeypatch: pytest.
         api_other = other.get("/maps/farm/tmap2", 202).headers["location"]
         assert api_other != where
         other.problem("GET", where, 404)
+        own, others = (path.rpartition("/")[2] for path in (where, api_other))
+        listed = [[job["id"] for job in client.get("jobs").json()] for client in (api, other)]
+        assert listed == [[others, own], [others]], "newest first"
+        assert api.token_for("admin", environments="farm").get("jobs").json() == []
+        assert [job["id"] for job in api.get("jobs?state=running&limit=1").json()] == [others]
+        assert api.get("jobs?state=done").json() == []
         gate.set()
         deadline = time.monotonic() + 30
         while (job := api.get(where).json())["state"] == "running":

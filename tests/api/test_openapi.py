@@ -64,7 +64,8 @@ def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
         "/api/v1/keys": "get post", f"{v}/manifest": "get", f"{e}/derivations": "post", f"{e}/alignments": "post",
         "/api/v1/robots": "get", "/api/v1/robots/{robot}": "get delete", "/api/v1/robots/{robot}/status": "put",
         "/api/v1/audit": "get",
-        "/api/v1/jobs/{id}": "get delete", "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete",
+        "/api/v1/jobs": "get", "/api/v1/jobs/{id}": "get delete",
+        "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete",
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
     }  # fmt: skip
     by_format = {f"/maps/{{env}}/{known.name}" for known in all_formats().values() if known.write}

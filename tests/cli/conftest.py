@@ -137,7 +137,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def offline(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Fleetmap:
     """Run a command in this process, without a server in its environment."""
     for name in list(os.environ):
-        if name.startswith("FLEETMAP_"):
+        if name.startswith("FLEETMAP_") or name == "COLUMNS":
             monkeypatch.delenv(name)
 
     def call(*arguments: str | Path) -> Result:

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 from app.cli import client as clients
-from app.cli.client import Client, LocalFile, Refused
+from app.cli.client import Client, LocalFile
+from app.cli.problems import Refused
 from app.cli.write import inside, unpack
 from app.errors import Invalid
 
@@ -170,10 +171,22 @@ def test_a_missing_token_gets_a_hint(talk: Talk) -> None:
 
 def test_a_missing_environment_gets_a_hint(talk: Talk) -> None:
     problem = {"title": "Not found", "detail": "there is no environment 'x'"}
-    client, _ = talk(reply(404, problem, "application/problem+json"))
+    client, _ = talk(reply(404, problem, "application/problem+json"), reply(200, [{"name": "other"}]))
     with pytest.raises(Refused) as caught:
         client.get("/environments/x")
-    assert "fleetmap versions" in caught.value.hint
+    assert caught.value.hint == "`fleetmap environment list` lists all."
+
+
+def test_missing_environment_proposes_the_nearest_one_the_token_sees(talk: Talk) -> None:
+    problem = {"title": "Not found", "detail": "there is no environment 'fram-7'"}
+    names = reply(200, [{"name": name} for name in ("orchard", "farm-7")])
+    client, _ = talk(reply(404, problem, "application/problem+json"), names)
+    with pytest.raises(Refused) as caught:
+        client.get("/environments/fram-7/versions/latest")
+    assert caught.value.hint.startswith("Did you mean farm-7?")
+    client, _ = talk(reply(404, problem, "application/problem+json"))
+    with pytest.raises(Refused, match="no environment 'fram-7'"):
+        client.get("/environments/fram-7")  # the list is refused as well: the first error is told
 
 
 def test_another_kind_of_server_is_recognised(talk: Talk) -> None:

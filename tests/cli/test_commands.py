@@ -80,7 +80,7 @@ def test_versions_diff_promote_and_revert(fleetmap: Fleetmap, network: Path, tmp
     assert fleetmap("revert", "story", "production").status == 0
     roots = {row["version"]: row["root"] for row in fleetmap("versions", "story", "--json").json}
     assert roots[3] == roots[1] != roots[2]
-    assert "hold the same" in fleetmap("diff", "story", "1", "3").out
+    assert "have the same content" in fleetmap("diff", "story", "1", "3").out
     assert len(fleetmap("versions", "story", "-n", "2", "--json").json) == 2
 
 
@@ -128,14 +128,14 @@ def test_a_planned_promotion_waits(fleetmap: Fleetmap, network: Path) -> None:
 def test_a_promotion_in_two_stages(fleetmap: Fleetmap, network: Path) -> None:
     history(fleetmap, network, "staged")
     told = fleetmap("promote", "staged", "1", "--ready", "0.9", "--failed", "0.2", "--deadline", "2099-01-31T06:00:00Z")
-    assert told.out.strip() == "staged: production will stand on version 1 when 0.9 of its online robots have it"
+    assert told.out.strip() == "staged: production will point to version 1 when 0.9 of its online robots have it"
     body = fleetmap("promote", "staged", "1", "--ready", "0.9", "--window", "60", "--json").json
     assert body["version"] is None
     assert (body["rollout"]["state"], body["rollout"]["ready"], body["rollout"]["window"]) == ("waiting", 0.9, 60.0)
     assert "nothing is planned" in fleetmap("promote", "staged", "--cancel").out
     assert fleetmap("promote", "staged", "--cancel").status == 1, "there is nothing to cancel any more"
     assert fleetmap("promote", "staged", "--cancel", "--ready", "0.5").status == 2
-    assert fleetmap("promote", "staged", "1").out.strip() == "staged: production stands on version 1"
+    assert fleetmap("promote", "staged", "1").out.strip() == "staged: production points to version 1"
     assert "moves back" in fleetmap("promote", "staged", "2", "--failed", "0.2").out
     alone = fleetmap("promote", "staged", "2", "--window", "60")
     assert alone.status == 1
@@ -204,7 +204,8 @@ def test_a_damaged_file_is_refused_with_its_place(fleetmap: Fleetmap, tmp_path: 
     problem = json.loads(fleetmap("import", bad, "-e", "damaged", "-f", "tmap2", "--json").err)
     assert problem["status"] == 422
     assert problem["errors"][0]["file"] == "bad.tmap2.yaml"
-    assert all(row["version"] == 0 for row in fleetmap("versions", "damaged", "--json").json)
+    assert "no environment" in fleetmap("environment", "show", "damaged").err, "nothing is left behind"
+    assert fleetmap("import", bad.with_name("network.tmap2.yaml"), "-e", "damaged").status == 1
 
 
 def test_the_same_problem_without_a_server(offline: Fleetmap, tmp_path: Path) -> None:

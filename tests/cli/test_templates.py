@@ -53,7 +53,7 @@ def test_a_set_and_values_of_an_environment(fleetmap: Fleetmap, farm: str, tmp_p
         line.split() for line in fleetmap("template", farm, "tmap2").out.splitlines()
     ]
     out = tmp_path / "network.yaml"
-    exported = fleetmap("export", farm, "tmap2", "-o", out)
+    exported = fleetmap("export", farm, "tmap2", "-o", out, "-v")
     assert "action: NavigateToPose" in out.read_text()
     assert "filled in: edges: action = NavigateToPose (environment): " in exported.err
     assert "~ templates tmap2 action: none → NavigateToPose" in fleetmap("diff", farm, str(first)).out

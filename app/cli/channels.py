@@ -1,0 +1,120 @@
+"""``fleetmap channels``: which version each channel points to, and which robots have it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import typer
+
+from app.cli import completion, options, output
+from app.cli.client import Client, path_of
+from app.cli.groups import Commands
+from app.cli.problems import Refused
+from app.model.names import did_you_mean
+
+commands = Commands("List channels, the versions they point to, and how their robots follow. `promote` moves one.")
+
+Channel = Annotated[str, typer.Argument(help="Name of the channel.", autocompletion=completion.versions)]
+
+
+@commands.command("list")
+def list_channels(
+    environment: options.Environment,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """List the channels of an environment, and how many robots have what they point to.
+
+    Example: `fleetmap channels list farm`
+    """
+    with Client(server, token) as client:
+        rows = client.get(path_of("environments", environment, "channels"))
+    if as_json:
+        output.show_json(rows)
+        return
+    output.show_table(
+        ("channel", "version", "since (UTC)", "author", "planned", "robots with it", "failed", "closures"),
+        (
+            (
+                row["channel"],
+                "-" if row["version"] is None else row["version"],
+                output.minute(row.get("time")),
+                row.get("author"),
+                planned(row),
+                f"{row['robots']['holding']} of {row['robots']['total']}",
+                row["robots"]["failed"],
+                row["overlays"]["count"],
+            )
+            for row in rows
+        ),
+    )
+
+
+@commands.command("show")
+def show(
+    environment: options.Environment,
+    channel: Channel,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Show one channel: version, plan, roll-out and robots.
+
+    Example: `fleetmap channels show farm production`
+    """
+    with Client(server, token) as client:
+        rows = client.get(path_of("environments", environment, "channels"))
+    found = next((row for row in rows if row["channel"] == channel), None)
+    if found is None:
+        names = [row["channel"] for row in rows]
+        detail = f"{environment} has no channel {channel!r}{did_you_mean(channel, names)}; it has: {', '.join(names)}"
+        raise Refused({"title": "Not found", "detail": detail}, status=404)
+    if as_json:
+        output.show_json(found)
+        return
+    robots, rollout = found["robots"], found.get("rollout") or {}
+    output.show_members(
+        {
+            "channel": found["channel"],
+            "version": "none" if found["version"] is None else str(found["version"]),
+            "since (UTC)": output.minute(found.get("time")),
+            "author": found.get("author"),
+            "planned": planned(found),
+            "roll-out": ", ".join(f"{name} {value}" for name, value in rollout.items() if value is not None),
+            "robots": f"{robots['holding']} of {robots['total']} have it, {robots['lagging']} are behind, "
+            f"{robots['failed']} failed, {robots['ready']} are ready for the plan",
+            "closures": f"{found['overlays']['count']} in force",
+            "root hash": found.get("root"),
+        }
+    )
+
+
+@commands.command("cancel")
+def cancel(
+    environment: options.Environment,
+    channel: Channel,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Cancel the planned move of a channel: it stays where it is. The same as `promote --cancel`.
+
+    Example: `fleetmap channels cancel farm production`
+    """
+    with Client(server, token) as client:
+        client.delete(path_of("environments", environment, "channels", channel, "planned"))
+    if as_json:
+        output.show_json({"environment": environment, "channel": channel, "planned": None})
+    else:
+        output.show(f"{environment}: nothing is planned for {channel} any more")
+
+
+def planned(row: Mapping[str, Any]) -> str:
+    """Format what is planned for a channel: ``version 3 at 2026-05-01 08:30``."""
+    plan = row.get("planned")
+    if not plan:
+        return ""
+    time = output.minute(plan.get("activate_at"))
+    return f"version {plan['version']}{f' at {time}' if time else ''}"

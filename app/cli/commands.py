@@ -1,0 +1,153 @@
+"""The commands of ``fleetmap``: their modules, their panels in the help, and the one that a call needs."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app import __version__
+from app.cli import groups
+
+if TYPE_CHECKING:
+    from typer._click import Context
+
+
+PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
+    "Maps": (
+        ("import", "maps:import_maps"),
+        ("export", "maps:export_map"),
+        ("coverage", "maps:coverage"),
+        ("link", "maps:link"),
+        ("template", "templates:template"),
+    ),
+    "Files on this machine (no server needed)": (
+        ("convert", "maps:convert"),
+        ("check", "maps:check"),
+        ("formats", "maps:list_formats"),
+    ),
+    "Environments and their versions": (
+        ("environment", "environments:commands"),
+        ("versions", "history:versions"),
+        ("diff", "history:diff"),
+        ("revert", "history:revert"),
+        ("where", "position:locate"),
+        ("derive", "history:derive"),
+        ("align", "align:align"),
+        ("generate", "generate:generate"),
+    ),
+    "Fleet": (
+        ("promote", "history:promote"),
+        ("channels", "channels:commands"),
+        ("robots", "robots:commands"),
+        ("overlays", "overlays:commands"),
+        ("events", "events:events"),
+        ("agent", "agent:agent"),
+        ("agent-level", "agent:agent_level"),
+    ),
+    "Server": (
+        ("serve", "serving:serve"),
+        ("demo", "serving:demo"),
+        ("token", "tokens:commands"),
+        ("keys", "keys:commands"),
+        ("jobs", "jobs:commands"),
+        ("migrate", "serving:migrate"),
+    ),
+}
+"""Commands in the order of the help: name, and where its function or group is (below ``app.cli``)."""
+
+ALIASES: Mapping[str, str] = {
+    "environments": "environment",
+    "channel": "channels",
+    "robot": "robots",
+    "overlay": "overlays",
+    "event": "events",
+    "tokens": "token",
+    "key": "keys",
+    "job": "jobs",
+    "format": "formats",
+    "version": "versions",
+}
+"""Further names of commands; the help does not list them."""
+
+NEGATIVE_ARGUMENTS = frozenset({"where"})
+"""Commands whose argument may start with a minus: a southern latitude is no option."""
+
+
+def needed(arguments: Sequence[str]) -> str | None:
+    """Return the only command that a call needs: the fewer are imported, the sooner it starts. None: all of them."""
+    if "_FLEETMAP_COMPLETE" not in os.environ:
+        return groups.first_command(arguments)
+    typed = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS") or ""
+    words = [*typed.split(), *[""][: typed.endswith(" ")]]
+    only = groups.first_command(words[1:-1])
+    return only if only != "serve" or find_spec("pydantic_settings") is not None else None
+
+
+class Root(groups.Group):
+    """All commands, in the order of the panels."""
+
+    def list_commands(self, ctx: Context) -> list[str]:
+        """Return the names as the help lists them."""
+        order = [name for commands in PANELS.values() for name, _ in commands]
+        return sorted(super().list_commands(ctx), key=lambda name: order.index(ALIASES.get(name, name)))
+
+
+def build(only: str | None = None) -> typer.Typer:
+    """Build the commands.
+
+    Args:
+        only: the command that is needed: others are neither imported nor built. All of them for None and for a name
+            that is no command's. Only if it is named, ``serve`` gets an option for every setting: these import
+            the server's settings.
+    """
+    app = groups.Commands(
+        "Store versioned maps of every environment, and give each robot the map in its own format.",
+        cls=Root,
+        no_args_is_help=True,
+        add_completion=True,
+        pretty_exceptions_enable=False,
+        epilog="New here? `fleetmap serve --demo`. A command's options and an example: `fleetmap COMMAND --help`.",
+    )
+
+    @app.callback()
+    def common(
+        version: Annotated[
+            bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+        ] = False,
+    ) -> None:
+        pass
+
+    panels = {name: panel for panel, commands in PANELS.items() for name, _ in commands}
+    places = {name: place for commands in PANELS.values() for name, place in commands}
+    if only is not None and only in ALIASES:
+        places = {only: places[ALIASES[only]]}
+    elif only is not None and only in places:
+        places = {only: places[only]}
+    for name, place in places.items():
+        module, _, member = place.partition(":")
+        found = getattr(importlib.import_module(f"app.cli.{module}"), member)
+        shown: dict[str, Any] = {"rich_help_panel": panels.get(name), "hidden": name in ALIASES}
+        if isinstance(found, typer.Typer):
+            app.add_typer(found, name=name, **shown)
+            continue
+        if name == "serve":
+            found = sys.modules["app.cli.serving"].with_flags(found) if only == "serve" else _serve_without_flags
+        settings = {"ignore_unknown_options": True} if name in NEGATIVE_ARGUMENTS else None
+        app.command(name, context_settings=settings, **shown)(found)
+    return app
+
+
+def _serve_without_flags() -> None:
+    """Start the server, with a demo if you like."""
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        sys.stdout.write(f"fleetmap {__version__}\n")
+        raise typer.Exit

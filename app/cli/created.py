@@ -1,0 +1,135 @@
+"""The environment that an import or a generated site goes into: created if absent, removed again if the work fails."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from app.cli.client import MAX_NAMES, Client, path_of
+from app.cli.problems import Refused
+from app.errors import FleetMapError, Invalid
+from app.model.frame import Datum
+
+LABEL = 2
+"""Characters: words of a name up to this length distinguish siblings (``hall-a``, ``hall-b``); they are no slips."""
+
+LONG_WORD = 8
+"""Characters from which a word may have two slips instead of one."""
+
+
+@contextmanager
+def ensured(
+    client: Client,
+    name: str,
+    *,
+    datum: Datum | None,
+    title: str | None = None,
+    create: bool | None = True,
+    dry_run: bool = False,
+) -> Iterator[bool]:
+    """Give the block an environment with a datum, and undo both if the block fails.
+
+    Args:
+        create: whether one that does not exist is created; None: unless its name looks like a slip.
+        dry_run: nothing is created or changed.
+
+    Yields whether the environment was created now. Raises Refused or Invalid if it must not be created.
+    """
+    wanted = datum.as_dict() if datum else None
+    try:
+        known = client.get(path_of("environments", name))
+    except Refused as refused:
+        if refused.status != 404 or str(refused.problem.get("type")).endswith(":gone"):
+            raise
+        if dry_run:
+            detail = f"there is no environment {name} yet, and a dry run does not create it"
+            raise Refused({"title": "No such environment", "detail": detail}, status=404, hint=refused.hint) from None
+        _check_new(client, name, create, refused)
+        made = client.post("/environments", {"name": name, "title": title, "datum": wanted})
+        with _undone(lambda: _remove(client, made), f"The environment {name}, created for this, could not be removed"):
+            yield True
+        return
+    if wanted is None or (known.get("datum") or {}) == wanted or dry_run:
+        yield False
+        return
+    client.patch(path_of("environments", name), {"datum": wanted})
+    with _undone(lambda: _take_back(client, known), f"The new datum of {name} could not be taken back"):
+        yield False
+
+
+def _check_new(client: Client, name: str, create: bool | None, refused: Refused) -> None:
+    """Raise Refused or Invalid unless an environment of this name may be created."""
+    if create is False:
+        raise refused
+    if create is None:
+        near = slip(name, (row["name"] for row in client.pages("/environments", {}, limit=MAX_NAMES)))
+        if near is not None:
+            raise Invalid(f"there is no environment {name!r} (did you mean {near}?): use --create if the name is right")
+
+
+@contextmanager
+def _undone(undo: Any, failure: str) -> Iterator[None]:
+    """Undo the preparation if the block fails or is interrupted; report it if that fails as well."""
+    try:
+        yield
+    except BaseException as error:
+        try:
+            undo()
+        except (Refused, FleetMapError) as second:
+            if isinstance(error, Refused):
+                error.hint = f"{error.hint}\n{failure}: {second}".strip()
+        raise
+
+
+def _remove(client: Client, made: Mapping[str, Any]) -> None:
+    """Remove an environment permanently, unless another client has changed it since."""
+    place = path_of("environments", made["name"])
+    if client.get(place)["version"] == made["version"]:
+        client.delete(place)
+        client.post(f"{place}/purge", {})
+
+
+def _take_back(client: Client, known: Mapping[str, Any]) -> None:
+    """Return to the version before the datum was set, unless another client has made a version since."""
+    place = path_of("environments", known["name"])
+    if client.get(place)["version"] == known["version"] + 1:
+        message = "take back the datum: the import it was for failed"
+        client.post(f"{place}/versions", {"revert_to": known["version"], "message": message}, repeat=True)
+
+
+def slip(name: str, existing: Iterable[str]) -> str | None:
+    """Return the existing name that a new one looks like a slip of; None for names that only number siblings.
+
+    ``fram-7`` is a slip of ``farm-7``; ``farm-8`` and ``hall-b`` are none of ``farm-7`` and ``hall-a``.
+    """
+    return next((other for other in existing if _is_slip(_words(name), _words(other))), None)
+
+
+def _words(name: str) -> list[str]:
+    return re.findall(r"[a-z]+|[0-9]+", name)
+
+
+def _is_slip(words: list[str], others: list[str]) -> bool:
+    if len(words) != len(others) or words == others:
+        return "".join(words) == "".join(others)
+    pairs = [(a, b) for a, b in zip(words, others, strict=True) if a != b]
+    return all(max(len(a), len(b)) > LABEL and not (a + b).isdigit() and _is_near(a, b) for a, b in pairs)
+
+
+def _is_near(a: str, b: str) -> bool:
+    return _slips(a, b) <= (1 if max(len(a), len(b)) < LONG_WORD else 2)
+
+
+def _slips(a: str, b: str) -> int:
+    """Count letters added, left out, changed or swapped between two words (optimal string alignment)."""
+    before: list[int] = []
+    row = list(range(len(b) + 1))
+    for i, x in enumerate(a, 1):
+        older, before, row = before, row, [i] + [0] * len(b)
+        for j, y in enumerate(b, 1):
+            row[j] = min(before[j] + 1, row[j - 1] + 1, before[j - 1] + (x != y))
+            if i > 1 and j > 1 and x == b[j - 2] and y == a[i - 2]:
+                row[j] = min(row[j], older[j - 2] + 1)
+    return row[-1]

@@ -1,0 +1,241 @@
+"""``fleetmap environment``: create, list, describe, rename and delete environments."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from app.cli import completion, options, output
+from app.cli.client import Client, path_of
+from app.cli.folder import check_name
+from app.cli.groups import Commands
+
+commands = Commands("List, create, rename and delete environments.")
+
+Deleted = Annotated[str, typer.Argument(help="Name of a deleted environment.")]
+Title = Annotated[str | None, typer.Option("--title", help="Title for people.")]
+Description = Annotated[str | None, typer.Option("--description", help="Description for people.")]
+Tags = Annotated[list[str] | None, typer.Option("--tag", help="Tag; repeatable.")]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
+
+
+@commands.command("list")
+def list_environments(
+    query: Annotated[
+        str | None, typer.Option("--query", "-q", help="Only with this text in name, title, description or tags.")
+    ] = None,
+    deleted: Annotated[bool, typer.Option("--deleted", help="Only deleted ones: they can be restored.")] = False,
+    limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="Maximum number.")] = 1000,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """List the environments that your token may see, by name.
+
+    Example: `fleetmap environment list --query orchard`
+    """
+    parameters = {"limit": min(limit, 100), "q": query, "deleted": "true" if deleted else None}
+    with Client(server, token) as client:
+        rows = list(client.pages("/environments", parameters, limit=limit))
+    if as_json:
+        output.show_json(rows)
+        return
+    output.show_table(
+        ("environment", "version", "changed (UTC)", "title"),
+        ((row["name"], row["version"], output.minute(row.get("updated")), row.get("title")) for row in rows),
+    )
+
+
+@commands.command("show")
+def show(
+    environment: options.Environment,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Show an environment: datum, bounds, newest version and channels.
+
+    Example: `fleetmap environment show farm`
+    """
+    with Client(server, token) as client:
+        found = client.get(path_of("environments", environment))
+        channels = client.get(path_of("environments", environment, "channels"), {"robots": "false"})
+    if as_json:
+        output.show_json(found)
+        return
+    west_south_east_north = found.get("bounds")
+    output.show_members(
+        {
+            "environment": found["name"],
+            "title": found.get("title"),
+            "description": found.get("description"),
+            "tags": ", ".join(found.get("tags") or ()),
+            "newest version": str(found["version"]),
+            "channels": ", ".join(f"{c['channel']} → {c['version']}" for c in channels if c["version"] is not None),
+            "datum": output.datum(found.get("datum")),
+            "bounds (west, south, east, north)": ", ".join(f"{n:.6f}" for n in west_south_east_north or ()),
+            "created (UTC)": output.minute(found.get("created")),
+            "changed (UTC)": output.minute(found.get("updated")),
+            "root hash": found.get("root"),
+        }
+    )
+
+
+@commands.command("create")
+def create(
+    environment: Annotated[str, typer.Argument(help="Name: a-z, 0-9, - and _.", show_default=False)],
+    datum: options.DatumText = None,
+    title: Title = None,
+    description: Description = None,
+    tag: Tags = None,
+    clone: Annotated[
+        str | None,
+        typer.Option(
+            "--clone",
+            metavar="ENVIRONMENT[@VERSION]",
+            help="Start with the content of this environment, or of one of its versions or channels.",
+            autocompletion=completion.environments,
+        ),
+    ] = None,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Create an environment (as administrator). `import` and `generate` create one as well.
+
+    Example: `fleetmap environment create farm --datum 53.2686,-0.5245 --title 'North farm'`
+    """
+    check_name(environment)
+    where = options.datum(datum)
+    body: dict[str, Any] = {"name": environment, "title": title, "description": description, "tags": tag}
+    body["datum"] = where.as_dict() if where else None
+    if clone is not None:
+        name, _, version = clone.partition("@")
+        body["clone"] = {"environment": name, "version": version or "latest"}
+    with Client(server, token) as client:
+        made = client.post("/environments", body)
+    _show_result(made, f"{made['name']}: created, version {made['version']}", as_json=as_json)
+
+
+@commands.command("rename")
+def rename(
+    environment: options.Environment,
+    name: Annotated[str | None, typer.Argument(help="New name; leave it out to change only the texts below.")] = None,
+    title: Title = None,
+    description: Description = None,
+    tag: Tags = None,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Change an environment's name, title, description or tags (as administrator).
+
+    Robots and links that use the old name no longer find the environment.
+
+    Example: `fleetmap environment rename farm north-farm --title 'North farm'`
+    """
+    body = {"name": name, "title": title, "description": description, "tags": tag}
+    if all(value is None for value in body.values()):
+        raise typer.BadParameter("give a new name, --title, --description or --tag")
+    if name is not None:
+        check_name(name)
+    with Client(server, token) as client:
+        changed = client.patch(path_of("environments", environment), body)
+    what = f"is now called {changed['name']}" if name not in (None, environment) else "changed"
+    _show_result(changed, f"{environment}: {what}", as_json=as_json)
+
+
+@commands.command("datum")
+def set_datum(
+    environment: options.Environment,
+    datum: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[LAT,LON[,HEADING]]",
+            help="Position of the local origin in degrees, and heading clockwise from north [default: show it].",
+        ),
+    ] = None,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Show or set the datum: where the local origin is on earth. A new datum makes a version.
+
+    Content in metres keeps its metres; content with positions on earth keeps these.
+
+    Example: `fleetmap environment datum farm 53.2686,-0.5245,12.5`
+    """
+    where = options.datum(datum)
+    with Client(server, token) as client:
+        place = path_of("environments", environment)
+        found = client.get(place) if where is None else client.patch(place, {"datum": where.as_dict()})
+    if as_json:
+        output.show_json(found["datum"] if where is None else found)
+        return
+    version = "" if where is None else f", version {found['version']}"
+    output.show(f"{environment}: datum {output.datum(found.get('datum'))}{version}")
+    output.show_warnings(found.get("warnings") or ())
+
+
+@commands.command("delete")
+def delete(
+    environment: options.Environment,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Delete an environment (as administrator). It can be restored until it is purged.
+
+    Example: `fleetmap environment delete farm`
+    """
+    with Client(server, token) as client:
+        client.delete(path_of("environments", environment))
+    if as_json:
+        output.show_json({"environment": environment, "deleted": True})
+    else:
+        output.show(f"{environment}: deleted; `fleetmap environment restore {environment}` brings it back")
+
+
+@commands.command("restore")
+def restore(
+    environment: Deleted,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Restore a deleted environment with all its versions and channels (as administrator).
+
+    Example: `fleetmap environment restore farm`
+    """
+    with Client(server, token) as client:
+        found = client.post(path_of("environments", environment, "restore"), {})
+    _show_result(found, f"{environment}: restored, version {found['version']}", as_json=as_json)
+
+
+@commands.command("purge")
+def purge(
+    environment: Deleted,
+    yes: Yes = False,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Remove a deleted environment permanently, with all its versions (as administrator).
+
+    Only then its name is free again. It asks first, unless you give --yes.
+
+    Example: `fleetmap environment purge farm --yes`
+    """
+    if not yes:
+        typer.confirm(f"Remove {environment} and all its versions permanently?", abort=True, err=True)
+    with Client(server, token) as client:
+        client.post(path_of("environments", environment, "purge"), {})
+    if as_json:
+        output.show_json({"environment": environment, "purged": True})
+    else:
+        output.show(f"{environment}: removed permanently")
+
+
+def _show_result(found: Any, line: str, *, as_json: bool) -> None:
+    output.show_json(found) if as_json else output.show(line)

@@ -1,0 +1,90 @@
+"""``fleetmap events``: what happens on the server, as it happens."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections import deque
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import typer
+
+from app.cli import completion, options, output
+from app.cli.client import RETRY_SECONDS, Client
+from app.cli.problems import Refused
+
+MAX_PAUSE_SECONDS = 30.0
+"""Longest pause before a stream that ended is opened again."""
+
+
+def events(
+    environment: Annotated[
+        str | None,
+        typer.Option(
+            "--environment",
+            "-e",
+            help="Only events of this environment [default: of all that your token may see].",
+            autocompletion=completion.environments,
+        ),
+    ] = None,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Wait for further events, until Ctrl-C.")] = False,
+    since: Annotated[
+        int | None,
+        typer.Option(
+            "--since", min=0, metavar="ID", help="Only events after this id, the first column [default: the newest]."
+        ),
+    ] = None,
+    limit: Annotated[
+        int, typer.Option("--limit", "-n", min=0, help="Number of past events, the newest ones (without --since).")
+    ] = 10,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """List the newest events, or follow them: versions, channels that move, overlays, robots' status.
+
+    With --json each event is one line of JSON, with `id` and `type`. A stream that breaks is resumed where it ended.
+
+    Example: `fleetmap events --follow --environment farm`
+    """
+    with Client(server, token) as client:
+        query = {"environment": environment, "follow": "false", "since": since or 0}
+        past = deque(client.stream("/events", query), maxlen=None if since is not None else limit)
+        for event in past:
+            _show(event, as_json=as_json)
+        if follow:
+            _follow(client, environment, past[-1]["id"] if past else since, as_json=as_json)
+
+
+def _follow(client: Client, environment: str | None, last: int | None, *, as_json: bool) -> None:
+    """Print events until the process is interrupted; open the stream again where it ended."""
+    pause = RETRY_SECONDS
+    while True:
+        try:
+            for event in client.stream("/events", {"environment": environment, "since": last}):
+                _show(event, as_json=as_json)
+                last, pause = event["id"], RETRY_SECONDS
+        except Refused as refused:
+            if refused.status is not None and refused.status < 500:
+                raise
+            output.say(f"{refused}; trying again in {pause:g} s", style="yellow")
+        time.sleep(pause)
+        pause = min(MAX_PAUSE_SECONDS, pause * 2)
+
+
+def _show(event: Mapping[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        sys.stdout.write(json.dumps(event, ensure_ascii=False) + "\n")
+        sys.stdout.flush()
+        return
+    data = event["data"]
+    known = ("environment", "type", "time", "sequence", "epoch", "root")
+    rest = [f"{name} {value}" for name, value in data.items() if name not in known and _is_short(value)]
+    moment = str(data.get("time") or "")[:19].replace("T", " ")
+    output.show(f"{event['id']}  {moment}  {data.get('environment', '')}  {event['type']}  {', '.join(rest)}".rstrip())
+
+
+def _is_short(value: Any) -> bool:
+    return value not in (None, "") and not isinstance(value, (dict, list))

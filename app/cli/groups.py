@@ -1,0 +1,128 @@
+"""Groups of commands: help in panels, ``--json`` on either side of a command, and names that nearly exist."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup, TyperOption
+
+from app.model.names import nearest
+
+if TYPE_CHECKING:
+    from typer._click import Context, HelpFormatter
+
+MAX_WIDTH = 120
+"""Columns of help, however wide the terminal is: longer lines are hard to read."""
+
+PIPED_WIDTH = 100
+"""Columns of help where the output is no terminal."""
+
+JSON = "fleetmap.json"
+"""Key in a context's ``meta``: whether ``--json`` precedes the command."""
+
+LIST = "list"
+"""Command of a group of things that runs if none is named."""
+
+
+class Command(TyperCommand):
+    """A command with help in panels."""
+
+    def format_help(self, ctx: Context, formatter: HelpFormatter) -> None:  # noqa: ARG002  the base class's
+        """Print the help, as wide as the terminal."""
+        show_help(self, ctx)
+
+
+class Group(TyperGroup):
+    """Commands that take ``--json`` before their name as well, and propose the nearest name for an unknown one."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.params.append(
+            TyperOption(
+                param_decls=["--json"],
+                is_flag=True,
+                default=False,
+                required=False,
+                expose_value=False,
+                callback=_note_json,
+                help="Print machine-readable JSON; also after the command.",
+            )
+        )
+
+    def resolve_command(self, ctx: Context, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        """Find the command of the first argument and hand ``--json`` on to it."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command, ["--json", *rest] if ctx.meta.pop(JSON, False) else rest
+
+    def format_help(self, ctx: Context, formatter: HelpFormatter) -> None:  # noqa: ARG002  the base class's
+        """Print the help, as wide as the terminal."""
+        show_help(self, ctx)
+
+
+class ListGroup(Group):
+    """Commands for one kind of thing. Without a command it lists: ``channels farm`` is ``channels list farm``."""
+
+    def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
+        """Put ``list`` before arguments that name no command, unless they are one with a slip in it."""
+        if not ctx.resilient_parsing:
+            first = next((argument for argument in args if argument != "--json"), "-")
+            named = first == "--help" or (not first.startswith("-") and nearest(first, self.commands) is not None)
+            args = args if named else [LIST, *args]
+        return super().parse_args(ctx, args)
+
+
+class Commands(typer.Typer):
+    """A group whose commands are of the classes above."""
+
+    def __init__(self, help: str, *, cls: type[Group] = ListGroup, **attributes: Any) -> None:
+        super().__init__(cls=cls, help=help, rich_markup_mode=None, **attributes)
+
+    def command(self, name: str | None = None, **attributes: Any) -> Callable[[Any], Any]:
+        """Register a function as a command."""
+        return super().command(name, **{"cls": Command, **attributes})
+
+
+def show_help(command: Command | Group, ctx: Context) -> None:
+    """Print the help of a command in panels, coloured, as wide as the terminal up to MAX_WIDTH."""
+    from typer import rich_utils
+
+    texts: list[Any] = [command, *command.get_params(ctx)]
+    texts += [*command.commands.values()] if isinstance(command, Group) else []
+    for text in texts:
+        if getattr(text, "help", None):
+            text.help = _markup(text.help)
+    rich_utils.MAX_WIDTH = _width()
+    rich_utils.FORCE_TERMINAL = None  # rich itself decides on colours, and honours FORCE_COLOR and NO_COLOR
+    rich_utils.rich_format_help(obj=command, ctx=ctx, markup_mode="rich")
+
+
+def _width() -> int:
+    piped = not sys.stdout.isatty() and not os.environ.get("COLUMNS")
+    return PIPED_WIDTH if piped else min(MAX_WIDTH, shutil.get_terminal_size().columns)
+
+
+def _markup(text: str) -> str:
+    """Turn a help text into rich's markup: its paragraphs unwrapped, brackets literal, code between `…` coloured."""
+    from rich.markup import escape
+
+    paragraphs = inspect.cleandoc(text).split("\n\n")
+    lines = [p if p.startswith("Example") else " ".join(p.split()) for p in paragraphs]
+    parts = escape("\n\n".join(lines)).split("`")
+    return "".join(f"[cyan]`{part}`[/]" if number % 2 else part for number, part in enumerate(parts))
+
+
+def _note_json(ctx: Context, parameter: Any, value: bool) -> bool:  # noqa: ARG001  as Typer calls it
+    if value:
+        ctx.meta[JSON] = True
+    return value
+
+
+def first_command(arguments: Sequence[str]) -> str | None:
+    """Return the first argument that is no option: the command, since no option before it takes a value."""
+    return next((argument for argument in arguments if not argument.startswith("-")), None)

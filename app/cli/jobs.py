@@ -1,0 +1,103 @@
+"""``fleetmap jobs``: work of the server that takes long."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from app.cli import options, output
+from app.cli.client import Client, path_of
+from app.cli.groups import Commands
+from app.model.names import did_you_mean
+
+commands = Commands("List, show and cancel the server's long-running work.")
+
+STATES = ("queued", "running", "done", "failed", "cancelled")
+
+Job = Annotated[str, typer.Argument(metavar="ID", help="Id of the job, as `fleetmap jobs list` shows it.")]
+
+
+@commands.command("list")
+def list_jobs(
+    state: Annotated[
+        str | None,
+        typer.Option(
+            "--state",
+            help="Only queued, running, done, failed or cancelled ones.",
+            autocompletion=lambda: list(STATES),
+        ),
+    ] = None,
+    limit: Annotated[int, typer.Option("--limit", "-n", min=1, max=1000, help="Maximum number.")] = 100,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """List the jobs of your token, newest first; as administrator, all of them.
+
+    Example: `fleetmap jobs list`
+    """
+    if state is not None and state not in STATES:
+        raise typer.BadParameter(f"--state is one of {', '.join(STATES)}{did_you_mean(state, STATES)}")
+    with Client(server, token) as client:
+        rows = client.get("/jobs", {"state": state, "limit": limit})
+    if as_json:
+        output.show_json(rows)
+        return
+    output.show_table(
+        ("id", "state", "progress", "started (UTC)", "detail"),
+        (
+            (row["id"], row["state"], f"{row['progress']:.0%}", output.minute(row["created"]), row["detail"])
+            for row in rows
+        ),
+    )
+
+
+@commands.command("show")
+def show(
+    job: Job,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Show one job: its progress, and where its result is or why it failed.
+
+    Example: `fleetmap jobs show 7f3a…`
+    """
+    with Client(server, token) as client:
+        found = client.get(path_of("jobs", job))
+    if as_json:
+        output.show_json(found)
+        return
+    output.show_members(
+        {
+            "job": found["id"],
+            "state": found["state"],
+            "progress": f"{found['progress']:.0%}",
+            "detail": found["detail"],
+            "problem": (found.get("problem") or {}).get("detail"),
+            "result": (found.get("result") or {}).get("location"),
+            "started (UTC)": output.minute(found["created"]),
+            "changed (UTC)": output.minute(found["updated"]),
+        }
+    )
+
+
+@commands.command("cancel")
+def cancel(
+    job: Job,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Cancel a job that runs. A job that has ended is removed from the list.
+
+    Example: `fleetmap jobs cancel 7f3a…`
+    """
+    with Client(server, token) as client:
+        running = client.get(path_of("jobs", job))["state"] in ("queued", "running")
+        client.delete(path_of("jobs", job))
+    if as_json:
+        output.show_json({"id": job, "cancelled": running, "removed": not running})
+    else:
+        output.show(f"job {job}: {'cancelled' if running else 'removed, since it had ended'}")

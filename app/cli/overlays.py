@@ -1,0 +1,208 @@
+"""``fleetmap overlays``: what is blocked now, as robots and people have reported it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from app.cli import completion, options, output
+from app.cli.client import Client, path_of
+from app.cli.groups import Commands
+from app.errors import Invalid
+from app.model.names import did_you_mean
+
+commands = Commands("List, report and decide on what is blocked for a time (closures).")
+
+STATES = ("pending", "accepted", "rejected", "expired", "ended")
+
+Overlay = Annotated[str, typer.Argument(metavar="ID", help="Id of the overlay, as `fleetmap overlays list` shows it.")]
+
+
+@commands.command("list")
+def list_overlays(
+    environment: options.Environment,
+    state: Annotated[
+        str | None,
+        typer.Option(
+            "--state",
+            help="Only pending, accepted (in force), rejected, expired or ended ones [default: all of 30 days].",
+            autocompletion=lambda: list(STATES),
+        ),
+    ] = None,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """List what was reported as blocked, oldest first.
+
+    Example: `fleetmap overlays list farm --state pending`
+    """
+    if state is not None and state not in STATES:
+        raise typer.BadParameter(f"--state is one of {', '.join(STATES)}{did_you_mean(state, STATES)}")
+    with Client(server, token) as client:
+        rows = client.get(path_of("environments", environment, "overlays"), {"state": state})
+    if as_json:
+        output.show_json(rows)
+        return
+    output.show_table(
+        ("id", "state", "what", "level", "until (UTC)", "reporter", "detail"),
+        (
+            (
+                row["id"],
+                row["state"],
+                what(row),
+                row["level"],
+                output.minute(row["expires"]),
+                row["reporter"],
+                row.get("detail"),
+            )
+            for row in rows
+        ),
+    )
+
+
+@commands.command("show")
+def show(
+    environment: options.Environment,
+    overlay: Overlay,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Show one overlay.
+
+    Example: `fleetmap overlays show farm 4f1c…`
+    """
+    with Client(server, token) as client:
+        rows = client.get(path_of("environments", environment, "overlays"))
+    found = next((row for row in rows if row["id"] == overlay), None)
+    if found is None:
+        near = did_you_mean(overlay, [row["id"] for row in rows])
+        raise Invalid(f"{environment} has no overlay {overlay!r} of the last 30 days{near}")
+    if as_json:
+        output.show_json(found)
+        return
+    polygon = found.get("polygon")
+    output.show_members(
+        {
+            "overlay": found["id"],
+            "state": found["state"],
+            "what": what(found),
+            "polygon": f"{json.dumps(polygon)} ({found['crs']})" if polygon else None,
+            "level": found["level"],
+            "detail": found.get("detail"),
+            "reporter": found["reporter"],
+            "reported (UTC)": output.minute(found["created"]),
+            "until (UTC)": output.minute(found["expires"]),
+            "decided by": found.get("decided_by"),
+            "decided (UTC)": output.minute(found.get("decided")),
+            "kept in version": found.get("version"),
+        }
+    )
+
+
+@commands.command("create")
+def create(
+    environment: options.Environment,
+    edge: Annotated[str | None, typer.Option("--edge", help="Id of the blocked edge: one direction of a lane.")] = None,
+    polygon: Annotated[
+        Path | None, typer.Option("--polygon", metavar="FILE", help="GeoJSON file with the blocked polygon.")
+    ] = None,
+    crs: Annotated[
+        str | None,
+        typer.Option("--crs", help="Coordinates of the polygon: wgs84 or local [default: wgs84 if there is a datum]."),
+    ] = None,
+    level: Annotated[
+        str | None,
+        typer.Option("--level", help="Level of the polygon [default: ground].", autocompletion=completion.levels),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=1, help="How long it is blocked [default: 3600].")
+    ] = None,
+    until: Annotated[
+        str | None, typer.Option("--until", metavar="TIME", help="When it ends (RFC 3339), instead of --seconds.")
+    ] = None,
+    detail: Annotated[str | None, typer.Option("--detail", "-m", help="What is in the way.")] = None,
+    accept: Annotated[
+        bool, typer.Option("--accept", help="Put it in force at once (as editor), instead of waiting for a decision.")
+    ] = False,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Report that an edge or an area is blocked for a time.
+
+    Example: `fleetmap overlays create farm --edge A_B --seconds 1800 --detail 'fallen tree' --accept`
+    """
+    if (edge is None) == (polygon is None):
+        raise typer.BadParameter("give --edge or --polygon, one of them")
+    if edge is not None and (crs is not None or level is not None):
+        raise typer.BadParameter("--crs and --level belong to --polygon")
+    body = {"kind": "blocked", "edge": edge, "crs": crs, "level": level, "ttl_seconds": seconds, "expires": until}
+    body |= {"detail": detail, "polygon": _polygon(polygon) if polygon else None}
+    body["state"] = "accepted" if accept else None
+    with Client(server, token) as client:
+        made = client.post(path_of("environments", environment, "overlays"), body)
+    _show_decided(environment, made, as_json=as_json)
+
+
+def _decision(name: str, help: str) -> Callable[..., None]:
+    """Make the command that decides on an overlay by posting to its sub-path of the same name."""
+
+    def decide(
+        environment: options.Environment,
+        overlay: Overlay,
+        server: options.Server = None,
+        token: options.Token = None,
+        as_json: options.Json = False,
+    ) -> None:
+        with Client(server, token) as client:
+            made = client.post(path_of("environments", environment, "overlays", overlay, name), {})
+        _show_decided(environment, made, as_json=as_json)
+
+    commands.command(name, help=f"{help}\n\nExample: `fleetmap overlays {name} farm 4f1c…`")(decide)
+    return decide
+
+
+accept = _decision("accept", "Put a pending overlay in force on every channel until its end (as editor).")
+reject = _decision("reject", "Reject a pending overlay: nothing changes (as editor).")
+end = _decision("end", "End an accepted overlay now: robots may use the edge or area again (as editor).")
+keep = _decision("keep", "Make an accepted overlay permanent in a new version (as editor). Promote that version then.")
+
+
+def what(row: Mapping[str, Any]) -> str:
+    """Name what an overlay blocks: ``edge A_B``, ``area``."""
+    return f"edge {row['edge']}" if row.get("edge") else "area"
+
+
+def _show_decided(environment: str, made: Mapping[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        output.show_json(made)
+        return
+    kept = f"; version {made['version']} keeps it blocked" if made.get("version") is not None else ""
+    until = f" until {output.minute(made['expires'])} UTC" if made["state"] in ("pending", "accepted") else ""
+    state = {"pending": "waits for a decision", "accepted": "is in force", "ended": "has ended"}
+    became = state.get(made["state"], f"is {made['state']}")
+    output.show(f"{environment}: overlay {made['id']} ({what(made)}) {became}{until}{kept}")
+
+
+def _polygon(path: Path) -> Any:
+    """Read the one polygon of a GeoJSON file: a geometry, a feature, or a collection of one. Raises Invalid."""
+    try:
+        found = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise Invalid(f"{path} is not JSON: {error}") from error
+    features = found.get("features") if isinstance(found, dict) else None
+    if isinstance(features, list):
+        if len(features) != 1:
+            raise Invalid(f"{path} has {len(features)} features: give a file with one polygon")
+        found = features[0]
+    if isinstance(found, dict) and found.get("type") == "Feature":
+        found = found.get("geometry")
+    if not isinstance(found, dict) or found.get("type") not in ("Polygon", "MultiPolygon"):
+        raise Invalid(f"{path} has no polygon: give a GeoJSON Polygon or MultiPolygon")
+    return found

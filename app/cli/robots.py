@@ -1,0 +1,141 @@
+"""``fleetmap robots``: what each robot runs, and which are behind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import typer
+
+from app.cli import completion, options, output
+from app.cli.client import Client, path_of
+from app.cli.groups import Commands
+
+commands = Commands("List robots, what they run, and which are offline or behind their channel.")
+
+InEnvironment = Annotated[
+    str | None,
+    typer.Option(
+        "--environment", "-e", help="Only in this environment [default: all].", autocompletion=completion.environments
+    ),
+]
+Robot = Annotated[str, typer.Argument(help="Name of the robot.")]
+
+
+@commands.command("list")
+def list_robots(
+    environment: InEnvironment = None,
+    channel: Annotated[
+        str | None,
+        typer.Option("--channel", "-c", help="Only on this channel.", autocompletion=completion.versions),
+    ] = None,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """List robots by environment and name.
+
+    Example: `fleetmap robots list --environment farm --channel production`
+    """
+    with Client(server, token) as client:
+        rows = list(client.pages("/robots", {"environment": environment, "channel": channel}))
+    if as_json:
+        output.show_json(rows)
+        return
+    output.show_table(
+        ("robot", "environment", "channel", "runs version", "state", "online", "behind", "last report (UTC)"),
+        (
+            (
+                row["robot"],
+                row["environment"],
+                row["channel"],
+                runs(row),
+                row["state"],
+                "yes" if row["online"] else "no",
+                behind(row),
+                output.minute(row["received"]),
+            )
+            for row in rows
+        ),
+    )
+
+
+@commands.command("show")
+def show(
+    robot: Robot,
+    environment: InEnvironment = None,
+    limit: Annotated[int, typer.Option("--limit", "-n", min=1, max=200, help="Number of former reports.")] = 10,
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Show one robot with its former reports, newest first.
+
+    Example: `fleetmap robots show mower-3`
+    """
+    with Client(server, token) as client:
+        found = client.get(path_of("robots", robot), {"environment": environment, "limit": limit})
+    if as_json:
+        output.show_json(found)
+        return
+    output.show_members(
+        {
+            "robot": found["robot"],
+            "environment": found["environment"],
+            "channel": found["channel"],
+            "runs version": runs(found),
+            "state": found["state"],
+            "detail": found.get("detail"),
+            "online": "yes" if found["online"] else "no",
+            "behind": behind(found),
+            "last report (UTC)": output.minute(found["received"]),
+            "also in": ", ".join(name for name in found["environments"] if name != found["environment"]),
+        }
+    )
+    output.show_table(
+        ("received (UTC)", "channel", "version", "state", "detail"),
+        (
+            (output.minute(one["received"]), one["channel"], one["version"], one["state"], one.get("detail"))
+            for one in found["history"]
+        ),
+    )
+
+
+@commands.command("forget")
+def forget(
+    robot: Robot,
+    environment: Annotated[
+        str,
+        typer.Option(
+            "--environment", "-e", help="Environment to forget it in.", autocompletion=completion.environments
+        ),
+    ],
+    server: options.Server = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Forget a robot that is out of service: it no longer counts for its channel. Its next report brings it back.
+
+    Example: `fleetmap robots forget mower-3 --environment farm`
+    """
+    with Client(server, token) as client:
+        client.delete(path_of("robots", robot), {"environment": environment})
+    if as_json:
+        output.show_json({"robot": robot, "environment": environment, "forgotten": True})
+    else:
+        output.show(f"{robot}: forgotten in {environment}")
+
+
+def runs(row: Mapping[str, Any]) -> str:
+    """Return the version that a robot runs."""
+    held = row.get("holds")
+    return str(held["version"]) if held else "none"
+
+
+def behind(row: Mapping[str, Any]) -> str:
+    """Format how far a robot is behind its channel; empty if it is not."""
+    lag = row.get("lag")
+    if not lag or not (lag["differs"] or lag["events"]):
+        return ""
+    since = f" since {output.minute(lag['since'])}" if lag.get("since") else ""
+    return f"{lag['events']} event{'' if lag['events'] == 1 else 's'}{since}"
