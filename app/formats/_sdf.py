@@ -101,8 +101,6 @@ def place_of(element: etree._Element) -> str:
 
 def parse(data: bytes, limits: Limits) -> etree._Element:
     """The ``<sdf>`` element without comments and indentation."""
-    if len(data) > limits.text_bytes:
-        raise TooLarge(f"the file has {len(data)} bytes of XML; the limit is {limits.text_bytes}")
     root = _xml.parse(data, limits, remove_blank_text=True)
     if root.tag != "sdf":
         raise wrong(f"the root element must be <sdf>, it is <{str(root.tag)[:80]}>", root)

@@ -6,7 +6,7 @@ import re
 
 from lxml import etree
 
-from app.errors import Problem, UnreadableFile
+from app.errors import Problem, TooLarge, UnreadableFile
 from app.formats import Limits
 from app.model.prolog import check_prolog
 
@@ -19,10 +19,13 @@ MAX_ATTRIBUTES = 256
 def parse(
     data: bytes, limits: Limits, *, keep_comments: bool = False, remove_blank_text: bool = False
 ) -> etree._Element:
-    """The root element. Raises UnreadableFile with the line, or XMLSyntaxError, which the read boundary explains.
+    """The root element. Raises TooLarge, UnreadableFile with the line, or XMLSyntaxError.
 
     remove_blank_text: leave out the white space that only indents (a third of the time and memory of such files).
     """
+    if len(data) > limits.text_bytes:
+        reason = f"{len(data)} bytes of XML; the limit for a text is {limits.text_bytes}"
+        raise TooLarge(reason, [Problem(reason)])
     check_prolog(data)
     parser = etree.XMLParser(
         resolve_entities=False,
