@@ -72,6 +72,9 @@ def is_georeferenced(data: bytes) -> bool:
     return OWN_TAG.encode() in data[start : start + size]
 
 
+MAX_BANDS = 1024
+"""Hyperspectral images have a few hundred; GDAL needs milliseconds for each, whatever its size."""
+
 GEO_KEYS = 34735
 GEOGRAPHIC, PROJECTED, USER_DEFINED = 2048, 3072, 32767
 
@@ -203,6 +206,8 @@ def _check_size(dataset: Any, limits: Limits) -> None:
             f"the TIFF says it has {width} × {height} = {width * height} pixels; the limit is {limits.pixels} "
             "(FLEETMAP_MAX_PIXELS)"
         )
+    if count > MAX_BANDS:
+        raise TooLarge(f"the TIFF says it has {count} bands; the limit is {MAX_BANDS}")
     if len(kinds) != 1 or kinds[0] not in DATA_TYPES:
         raise UnreadableFile(f"the TIFF's pixels are {', '.join(kinds)}; whole and floating numbers are read")
     size = width * height * count * np.dtype(kinds[0]).itemsize

@@ -106,10 +106,13 @@ def _refuse(reason: str, line: int | None = None, where: str | None = None) -> N
 
 def _is_box(box: Any) -> bool:
     """Whether these are four or six numbers, corner after corner, within the earth's longitudes and latitudes."""
-    numbers = isinstance(box, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in box)
-    if not numbers or len(box) not in (4, 6):
+    if not isinstance(box, list) or len(box) not in (4, 6):
         return False
-    west, south, east, north = *box[:2], *box[len(box) // 2 :][:2]
+    numbers = [float(v) for v in box if isinstance(v, (int, float)) and not isinstance(v, bool)]
+    if len(numbers) < len(box):
+        return False
+    half = len(numbers) // 2
+    west, south, east, north = numbers[0], numbers[1], numbers[half], numbers[half + 1]
     return max(abs(west), abs(east)) <= 180.0 and -90.0 <= south <= north <= 90.0
 
 

@@ -28,7 +28,7 @@ import shapely
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _navgraph_rules, _yaml, register
-from app.formats._fields import ANGLE, COORDINATE, Number, record
+from app.formats._fields import ANGLE, COORDINATE, Number, Record, record
 from app.formats._network import (
     AMONG_PARTS,
     Array,
@@ -88,10 +88,12 @@ _PROPERTIES = [
         shortcut_tolerance=_TOLERANCE,
     )
 ]
-SHAPE = record(
-    "graph-name root connections",
-    **{"default-properties": _PROPERTIES},
-    nodes=[record("name", pos=(COORDINATE, COORDINATE), properties=_PROPERTIES)],
+SHAPE = Record(
+    {
+        **dict.fromkeys(("graph-name", "root", "connections")),
+        "default-properties": _PROPERTIES,
+        "nodes": [record("name", pos=(COORDINATE, COORDINATE), properties=_PROPERTIES)],
+    }
 )
 """What a navgraph holds. Source: Fawkes, libs/navgraph/yaml_navgraph.cpp."""
 

@@ -102,7 +102,9 @@ _LANE = record(
 _WALL = record(
     "texture_name",
     alpha=Typed(Number(0.0, 1.0)),
-    **dict.fromkeys(("texture_height", "texture_scale", "texture_width"), Typed(NOT_NEGATIVE)),
+    texture_height=Typed(NOT_NEGATIVE),
+    texture_scale=Typed(NOT_NEGATIVE),
+    texture_width=Typed(NOT_NEGATIVE),
 )
 _DOOR = record(
     "name motion_axis plugin",
@@ -136,7 +138,7 @@ _LAYER = record(
     ),
 )
 _LEVEL = record(
-    "constraints drawing features fiducials layers lights physical_cameras",
+    "constraints drawing features fiducials lights physical_cameras",
     doors=[(ANY, ANY, _DOOR)],
     elevation=COORDINATE,
     flattened_x_offset=COORDINATE,
@@ -145,6 +147,7 @@ _LEVEL = record(
     holes=[_RING],
     human_lanes=[(ANY, ANY, _LANE)],
     lanes=[(ANY, ANY, _LANE)],
+    layers=record(each=_LAYER),
     measurements=[(ANY, ANY, record(distance=Typed(COORDINATE)))],
     models=[
         record("model_name name static dispensable lift_cabin", x=COORDINATE, y=COORDINATE, z=COORDINATE, yaw=ANGLE)
@@ -168,7 +171,7 @@ _LIFT = record(
 SHAPE = record(
     "coordinate_system crowd_sim graphs name reference_level_name",
     parameters=record(
-        "generate_crs", **dict.fromkeys(("suggested_offset_x", "suggested_offset_y"), Typed(Number(-1e9, 1e9)))
+        "generate_crs", suggested_offset_x=Typed(Number(-1e9, 1e9)), suggested_offset_y=Typed(Number(-1e9, 1e9))
     ),
     levels=record(each=_LEVEL),
     lifts=record(each=_LIFT),

@@ -64,7 +64,9 @@ ROWS = [
     Row("openrmf/clinic/clinic.building.yaml", r"alpha: \[3, [\d.]+", "alpha: [3, 200", refused="from 0 to 1"),
     Row("openrmf/clinic/clinic.building.yaml", r"speed_limit: \[3, [\d.]+", "speed_limit: [3, -1.0", refused="m/s"),
     Row("openrmf/clinic/clinic.building.yaml", r"type: \[1, \w+", "type: [1, portcullis", warned="'portcullis'"),
-    Row("openrmf/clinic/clinic.building.yaml", r"motion_degrees: \[3, \S+", "motion_degrees: [3, 4000]", refused="360"),
+    Row(
+        "openrmf/clinic/clinic.building.yaml", r"motion_degrees: \[3, [\d.]+", "motion_degrees: [3, 4000", refused="360"
+    ),
     Row("openrmf/clinic/clinic.building.yaml", r"depth: [\d.]+", "depth: 0", refused="above 0", where="lifts."),
     Row("openrmf/clinic/clinic.building.yaml", r"scale: [\d.]+", "scale: -1", refused="metres per pixel"),
     Row("openrmf/clinic/clinic.building.yaml", "reference_floor_name:", "reference_flor_name:", warned="unknown keys"),
@@ -151,8 +153,14 @@ def odd_files() -> list[tuple[str, Callable[[bytes], bytes], str]]:
         at = data.index(key) + len(key)
         return data[:at] + struct.pack("<H", 9999) + data[at + 2 :]
 
+    def many_bands(data: bytes) -> bytes:
+        tag = struct.pack("<HHI", 277, 3, 1)
+        at = data.index(tag) + len(tag)
+        return data[:at] + struct.pack("<H", 65281) + data[at + 2 :]
+
     return [
         ("octomap/shelf.ot", infinite, "no finite number"),
+        ("satellite/heights.tif", many_bands, "the limit is 1024"),
         ("satellite/orchard.tif", unknown_code, "EPSG:9999"),
     ]
 
