@@ -29,7 +29,8 @@ ANY: Final = None
 class Number:
     """A finite number from ``low`` to ``high``, also one in quotes; outside of ``usual`` it is doubtful.
 
-    above: the number must be larger than ``low``. hint: what a doubtful number may mean instead.
+    above: the number must be larger than ``low``. hint: what a doubtful number may mean instead. or_other: values of
+    other types are the reader's business.
     """
 
     low: float = -MAX_METRES
@@ -38,11 +39,14 @@ class Number:
     usual: tuple[float, float] | None = None
     hint: str = ""
     unit: str = ""
+    or_other: bool = False
 
     def check(self, value: Any) -> tuple[str, str]:
         """Return why the value is refused, and why it is doubtful; empty texts if it is not."""
         number = _number(value)
         unit = f" {self.unit}" if self.unit else ""
+        if number is None and self.or_other:
+            return "", ""
         if number is None:
             return f"must be a number{unit and ' of' + unit}, is {_shown(value)}", ""
         if not self.low <= number <= self.high or (self.above and number == self.low):

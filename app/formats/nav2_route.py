@@ -21,7 +21,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -80,19 +80,23 @@ class WriteOptions:
     frame_id: str = parameter(FRAME, "frame of nodes whose source names none")
 
 
+_SPEED, _LENGTH = replace(SPEED, or_other=True), replace(NOT_NEGATIVE, or_other=True)
 _METADATA = record(
     is_open=True,
-    speed_limit=SPEED,
-    abs_speed_limit=SPEED,
-    penalty=NOT_NEGATIVE,
-    abs_time_taken=NOT_NEGATIVE,
-    width=NOT_NEGATIVE,
+    is_loose=True,
+    speed_limit=_SPEED,
+    abs_speed_limit=_SPEED,
+    penalty=_LENGTH,
+    abs_time_taken=_LENGTH,
+    width=_LENGTH,
 )
 _FEATURE = record(
     is_open=True,
     type=Words(("Feature",)),
     properties=record(
-        "id startid endid overridable frame operations graph_id", metadata=_METADATA, cost=Number(0.0, 1e9)
+        "id startid endid overridable frame operations graph_id",
+        metadata=_METADATA,
+        cost=Number(0.0, 1e9, or_other=True),
     ),
 )
 SHAPE = record(is_open=True, type=Words(("FeatureCollection",)), features=[_FEATURE])

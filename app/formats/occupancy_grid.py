@@ -53,7 +53,7 @@ SHAPE = _fields.record(
     resolution=_fields.Number(
         1e-6, 1e4, usual=(1e-3, 10.0), hint="a cell this large holds a room; is it in metres?", unit="metres"
     ),
-    origin=(_fields.COORDINATE, _fields.COORDINATE, _fields.ANGLE),
+    origin=(_fields.COORDINATE, _fields.COORDINATE, replace(_fields.ANGLE, low=-MAX_METRES, high=MAX_METRES)),
 )
 """What a map's YAML holds. Source: Nav2's map_io, slam_toolbox."""
 
