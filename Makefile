@@ -16,7 +16,7 @@ SYNC := UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen 
 ROBOT := app/__init__.py app/errors.py app/event_types.py app/events/__init__.py app/events/login.py \
   app/events/messages.py app/model/__init__.py app/model/frame.py app/model/names.py app/signing.py app/agent app/cli
 
-.PHONY: run test lint bench chaos install install-dev clean
+.PHONY: run test lint bench chaos fuzz install install-dev clean
 
 run: install
 	@$(BIN)/fleetmap serve --demo $(ARGS)
@@ -39,6 +39,10 @@ bench: install-dev
 # Kills of the server, the router and the database at random moments: 50 of each; `make test` does 10.
 chaos: install-dev
 	@FLEETMAP_CHAOS=$${FLEETMAP_CHAOS:-50} $(BIN)/python -m pytest -s tests/chaos $(ARGS)
+
+# Mutations of every sample through the read boundary, for some minutes: ARGS="--minutes 30 --seed 7 --format kml".
+fuzz: install-dev
+	@$(BIN)/python -m tests.hostile.fuzz $(ARGS)
 
 install: $(VENV)/.installed
 

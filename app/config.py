@@ -299,6 +299,12 @@ class Settings(BaseSettings):
     max_unpacked_bytes: int = Field(
         default=_DEFAULTS.unpacked_bytes, ge=1, description="Most that the archives of one upload may unfold to."
     )
+    max_unpacked_ratio: int = Field(
+        default=_DEFAULTS.unpacked_ratio,
+        ge=1,
+        description="Most bytes that one byte of a compressed file may unfold to, on average. Does not count up to 16 "
+        "MiB, for pictures up to one byte for each of `max_pixels`.",
+    )
     max_files: int = Field(default=_DEFAULTS.files, ge=1, description="Most files in one upload or archive.")
     max_pixels: int = Field(default=_DEFAULTS.pixels, ge=1, description="Most pixels or cells of one picture or grid.")
     max_voxels: int = Field(default=_DEFAULTS.voxels, ge=1, description="Most nodes of one octree.")

@@ -10,6 +10,7 @@ import contextlib
 import gc
 import importlib
 import pkgutil
+import re
 import struct
 import zipfile
 import zlib
@@ -34,12 +35,17 @@ Files = Mapping[str, bytes]
 """A map as named files: relative path with forward slashes -> content."""
 
 
+UNPACKED_FREE_BYTES = 16 * 2**20
+"""Bytes that compressed content may unfold to whatever its ratio is."""
+
+
 @dataclass(frozen=True, slots=True)
 class Limits:
     """What an upload may hold. Every number is a setting; the defaults let real maps pass."""
 
     upload_bytes: int = 512 * 2**20
     unpacked_bytes: int = 1024 * 2**20
+    unpacked_ratio: int = 100
     files: int = 10_000
     pixels: int = 2**28
     voxels: int = 2**25
@@ -51,6 +57,22 @@ class Limits:
     seconds: float = 300.0
     memory_bytes: int = 8 * 2**30
     warnings: int = 1000
+
+    def max_unpacked(self, packed: int, free: int = UNPACKED_FREE_BYTES) -> int:
+        """Compute the maximum number of bytes that compressed content may unfold to.
+
+        Args:
+            packed: bytes of the compressed content.
+            free: bytes that any content may unfold to, whatever its ratio; small real files compress well.
+        """
+        return min(self.unpacked_bytes, max(free, self.unpacked_ratio * packed))
+
+    def check_unpacked(self, size: int, packed: int) -> None:
+        """Raise TooLarge if this much compressed content must not unfold to this many bytes."""
+        bound = self.max_unpacked(packed)
+        if size > bound:
+            reason = f"{packed} bytes unfold to more than {bound} bytes, which is the limit"
+            raise TooLarge(f"{reason}: upload it uncompressed, or in parts", [Problem(reason)])
 
 
 @dataclass(slots=True)
@@ -81,7 +103,7 @@ class ReadContext:
 
     def warn(self, problem: str, *, file: str | None = None, line: int | None = None, where: str | None = None) -> None:
         """Something doubtful that is stored all the same."""
-        if len(self.warnings) < self.limits.warnings:
+        if len(self.warnings) < MAX_RAW_WARNINGS:
             self.warnings.append(Problem(problem, file or self.main or None, line, where))
 
     def wants(self, layer: Layer) -> bool:
@@ -378,6 +400,7 @@ def read(item: Group, context: ReadContext) -> Layers:
     context.main = item.main
     if context.options is None:
         context.options = known.read_options()
+    earlier = len(context.warnings)
     try:
         with _without_collector():
             layers = known.read({**item.files, **item.borrowed} if item.borrowed else item.files, context)
@@ -400,7 +423,39 @@ def read(item: Group, context: ReadContext) -> Layers:
     count = sum(len(p) for p in layers.parts.values() if isinstance(p, Features))
     if count > context.limits.features:
         raise TooLarge(f"{item.main} has {count} features; the limit is {context.limits.features}")
+    context.warnings[earlier:] = grouped(context.warnings[earlier:], context.limits.warnings)
     return layers
+
+
+def grouped(warnings: Sequence[Problem], most: int) -> list[Problem]:
+    """Warnings of one file with those that repeat as one: the first of its kind, how many more, and where.
+
+    Two are of one kind if they differ only in names and numbers. Of kinds with at most ``ALIKE`` warnings all stay.
+    """
+    kinds: dict[tuple[str | None, str], list[Problem]] = {}
+    for one in dict.fromkeys(warnings):
+        kinds.setdefault((one.file, _VARIABLE.sub("…", one.problem)), []).append(one)
+    out: list[Problem] = []
+    for same in kinds.values():
+        if len(same) <= ALIKE:
+            out += same
+            continue
+        examples = "; ".join(dict.fromkeys(one.where or one.problem for one in same[1:ALIKE]))[:240]
+        reason = f"{same[0].problem} (and {len(same) - 1} more like it: {examples})"
+        out.append(replace(same[0], problem=reason))
+    if len(out) > most:
+        reason = f"and {len(out) - most} more warnings"
+        out[most:] = [Problem(reason, out[-1].file)]
+    return out
+
+
+ALIKE = 3
+"""Warnings of one kind that a file reports one by one."""
+
+MAX_RAW_WARNINGS = 100_000
+"""Warnings that are kept until they are grouped."""
+
+_VARIABLE = re.compile(r"""'[^']*'|"[^"]*"|\w+://\S+|\S*\d\S*|(?<=edge )\S+|^\S+(?= is not in the upload)""")
 
 
 def write(known: Format, layers: Layers, context: WriteContext) -> dict[str, bytes]:

@@ -36,6 +36,11 @@ _MASK16, _MASK32 = 0xFFFF, 0xFFFFFFFF
 _ZIP64, _UNICODE_PATH = 0x0001, 0x7075
 
 _CHUNK = 2**20
+
+_TEXTS = (".kml", ".xml", ".osm", ".sdf", ".world", ".dae", ".yaml", ".yml", ".json", ".geojson", ".tmap2", ".tmap")
+_TEXT_COST = 2
+"""What parsing a text costs beside keeping other content: it must compress by this factor less. Real ones reach 40."""
+_IMAGES = (".pgm", ".ppm", ".pnm", ".pbm", ".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
@@ -67,17 +72,12 @@ def unpack(data: bytes, limits: Limits) -> dict[str, bytes]:
     """The archive's files in the order of its central directory; folders are left out.
 
     Raises UnsafeArchive (links, devices, encryption, overlaps, colliding or escaping names, headers that disagree),
-    TooLarge (more files or bytes than ``limits.files`` and ``limits.unpacked_bytes``; real output is counted) or
+    TooLarge (more files or bytes than ``limits`` allow; real output is counted) or
     UnreadableFile (not a ZIP archive, damaged, an unknown compression).
     """
     entries, directory = _entries(data, limits)
     _check_names(entries)
-    declared = sum(e.size for e in entries)
-    if declared > limits.unpacked_bytes:
-        raise TooLarge(
-            f"the archive unfolds to {declared} bytes; the limit is {limits.unpacked_bytes}",
-            [Problem(f"declares {declared} bytes; the limit is {limits.unpacked_bytes}")],
-        )
+    _check_sizes(entries, len(data), limits)
     spans = []
     for entry in entries:
         start, end = _locate(data, entry, directory)
@@ -88,6 +88,36 @@ def unpack(data: bytes, limits: Limits) -> dict[str, bytes]:
             raise _unsafe("shares its bytes with another member", f"{before.name} and {entry.name}")
     places = {entry.name: start for _, _, start, entry in spans}
     return {e.name: _inflate(data, e, places[e.name]) for e in entries if not e.is_folder}
+
+
+def _check_sizes(entries: list[_Entry], packed: int, limits: Limits) -> None:
+    """Refuse what unfolds to too much for what it is: a text to be parsed, an image, or anything else.
+
+    ``_deflated`` counts what really comes out and stops at the declared size.
+    """
+    images = [e for e in entries if e.name.lower().endswith(_IMAGES)]
+    for e in entries:
+        if e.name.lower().endswith(_TEXTS):
+            bound = min(limits.text_bytes, limits.max_unpacked(e.packed // _TEXT_COST))
+            if e.size > bound:
+                raise _too_large(e.size, bound, f"the limit for a text of {e.packed} compressed bytes", e.name)
+    size_of_images = sum(e.size for e in images)
+    size = sum(e.size for e in entries)
+    if size > limits.unpacked_bytes:
+        raise _too_large(size, limits.unpacked_bytes, "the limit")
+    ratio = f"the limit for an archive of {packed} bytes"
+    for what, declared, bound in (
+        ("images", size_of_images, limits.max_unpacked(packed, limits.pixels)),
+        ("files", size - size_of_images, limits.max_unpacked(packed)),
+    ):
+        if declared > bound:
+            raise _too_large(declared, bound, ratio, what=f" of {what}")
+
+
+def _too_large(size: int, bound: int, limit: str, where: str | None = None, what: str = "") -> TooLarge:
+    place = f"{where}: " if where else ""
+    reason = f"declares {size} bytes{what}; {limit} is {bound}"
+    return TooLarge(f"the archive unfolds to too much: {place}{reason}", [Problem(reason, where=where)])
 
 
 def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:

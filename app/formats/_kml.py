@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
 from app.formats import ReadContext, _image, _xml
+from app.formats._fields import COORDINATE, LATITUDE, LONGITUDE, Number, Words
 from app.model.features import MAX_ID, NO_GEOMETRY, Features, unique_ids
 from app.model.frame import MAX_METRES, Datum, Level
 from app.model.geodesy import LocalFrame, local_frame
@@ -443,9 +444,53 @@ def read_kml(
             f"the root element is <{local_name(root)}>: KML starts with <kml>",
             [Problem(f"<{local_name(root)}> is not KML", line=root.sourceline)],
         )
+    _xml.warn_of_active_content(data, context)
+    _check_values(root, context)
     reader = _Reader(context, pictures)
     reader.read(root, name, entry)
     return reader.layers(), reader.used
+
+
+_TURN = Number(-360.0, 360.0, unit="degrees")
+_SIZE = Number(0.0, MAX_METRES)
+_FLAG = Words(("0", "1", "true", "false"))
+_VALUES: Mapping[str, Number | Words] = {
+    **dict.fromkeys(("rotation", "heading", "tilt", "roll"), _TURN),
+    **dict.fromkeys(("leftFov", "rightFov", "bottomFov", "topFov"), _TURN),
+    "latitude": LATITUDE,
+    "longitude": LONGITUDE,
+    **dict.fromkeys(("altitude", "minAltitude", "maxAltitude", "near"), COORDINATE),
+    **dict.fromkeys(("width", "scale", "refreshInterval", "viewRefreshTime", "viewBoundScale"), _SIZE),
+    "range": Number(0.0, 1e9, unit="metres"),
+    **dict.fromkeys(("open", "visibility", "extrude", "tessellate", "fill", "outline"), _FLAG),
+    "altitudeMode": Words(
+        ("clampToGround", "relativeToGround", "absolute", "clampToSeaFloor", "relativeToSeaFloor"),
+    ),
+}
+"""Plain values of KML, by element. Source: OGC KML 2.3, Google's gx extension."""
+
+
+def _check_values(root: etree._Element, context: ReadContext) -> None:
+    """Refuse values that are out of range, with the line; report unknown words."""
+    doubts: dict[str, tuple[int | None, int]] = {}
+    for name, rule in _VALUES.items():
+        for element in root.iter("{*}" + name):
+            text = (element.text or "").strip()
+            if not text or len(element):
+                continue
+            refusal, doubt = rule.check(text)
+            if refusal:
+                raise UnreadableFile(f"<{name}>: {refusal}", [Problem(refusal, line=element.sourceline, where=name)])
+            if doubt:
+                line, count = doubts.get(f"<{name}>: {doubt}", (element.sourceline, 0))
+                doubts[f"<{name}>: {doubt}"] = (line, count + 1)
+    for box in root.iter("{*}LatLonBox", "{*}LatLonAltBox"):
+        north, south = child_text(box, "north"), child_text(box, "south")
+        if _PLAIN_NUMBER.match(north) and _PLAIN_NUMBER.match(south) and float(north) < float(south):
+            reason = f"north {north} is south of south {south}"
+            raise UnreadableFile(f"<{local_name(box)}>: {reason}", [_at(reason, box.sourceline)])
+    for reason, (line, count) in doubts.items():
+        context.warn(reason if count == 1 else f"{reason} ({count} times)", line=line)
 
 
 class _Reader:

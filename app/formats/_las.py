@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import TooLarge, UnreadableFile
+from app.errors import UnreadableFile
 from app.formats import ReadContext, WriteContext
 from app.formats._points import AXES, RGB, Cloud, check_count, wrong
 
@@ -88,13 +88,12 @@ def _check(data: bytes, context: ReadContext) -> int:
     if form & 0x3F > 10:
         raise wrong(f"there is no point format {form & 0x3F}", where="header")
     check_count(count, context)
-    if count * record > context.limits.unpacked_bytes:
-        raise TooLarge(f"the points take {count * record} bytes; the limit is {context.limits.unpacked_bytes}")
     if form & 0xC0 == 0:
         if start + count * record > len(data):
             have = len(data) - start
             raise wrong(f"{count} points of {record} bytes take {count * record} bytes, the file has {have}")
     elif count:
+        context.limits.check_unpacked(count * record, len(data) - start)
         _check_chunks(data, start, size, vlrs, count, record)
     return int(count)
 

@@ -104,7 +104,7 @@ def unpack(data: bytes, limits: Limits, most: int | None = None) -> bytes:
     else:
         return data
     out, rest, size = [], data, 0
-    bound = limits.unpacked_bytes if most is None else most
+    bound = limits.max_unpacked(len(data)) if most is None else most
     try:
         while rest:
             stream = new()
@@ -115,7 +115,7 @@ def unpack(data: bytes, limits: Limits, most: int | None = None) -> bytes:
                 if size > bound:
                     if most is not None:
                         return b"".join(out)[:most]
-                    raise TooLarge(f"the file unfolds to more than {bound} bytes, which is the limit")
+                    limits.check_unpacked(size, len(data))
                 rest = stream.unconsumed_tail if hasattr(stream, "unconsumed_tail") else b""
                 if not piece and not rest and not stream.eof:
                     if most is not None:
@@ -620,11 +620,11 @@ def _pbf(data: bytes, limits: Limits) -> Data:
             out.bounds.append(
                 {"minlat": repr(low.lat), "minlon": repr(low.lon), "maxlat": repr(high.lat), "maxlon": repr(high.lon)}
             )
-        size = 0
+        size, bound = 0, limits.max_unpacked(len(data))
         for item in file:
             size += _take_pbf(out, item)
-            if size > limits.unpacked_bytes:
-                raise TooLarge(f"the file unfolds to more than {limits.unpacked_bytes} bytes, which is the limit")
+            if size > bound:
+                limits.check_unpacked(size, len(data))
             if len(out.ids) + len(out.ways) + len(out.relations) > limits.features:
                 raise TooLarge(f"the file has more than {limits.features} elements, which is the limit")
     except (RuntimeError, ValueError) as error:

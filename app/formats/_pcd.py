@@ -207,11 +207,10 @@ def _from_compressed(data: bytes, header: _Header, count: int, context: ReadCont
     )
     if fields is None:
         raise wrong(f"{count} points do not take the {size} bytes that the compressed data says", where="DATA")
-    if size > context.limits.unpacked_bytes:
-        raise TooLarge(f"the points take {size} bytes; the limit is {context.limits.unpacked_bytes}")
     start = header.body + 8
     if len(data) - start < packed:
         raise wrong(f"the compressed data has {len(data) - start} bytes, the file says {packed}", where="DATA")
+    context.limits.check_unpacked(size, packed)
     try:
         flat = expand(data[start : start + packed], size)
     except ValueError as error:

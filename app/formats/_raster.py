@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.errors import BadUpload, TooLarge, UnreadableFile
+from app.errors import BadUpload, Problem, TooLarge, UnreadableFile
 from app.formats import Limits
 from app.model.gdal import CACHE, DATA_TYPES, gdal, native, opened, taken
 from app.model.imagery import LOCAL, Affine, Picture
@@ -70,6 +70,29 @@ def is_georeferenced(data: bytes) -> bool:
         return True
     start, size = found.get(GDAL_METADATA, (0, 0))
     return OWN_TAG.encode() in data[start : start + size]
+
+
+MAX_BANDS = 1024
+"""Hyperspectral images have a few hundred; GDAL needs milliseconds for each, whatever its size."""
+
+GEO_KEYS = 34735
+GEOGRAPHIC, PROJECTED, USER_DEFINED = 2048, 3072, 32767
+
+
+def stated_code(data: bytes) -> int | None:
+    """The EPSG code that the first page of a TIFF says it lies in; None where it says none, or defines its own.
+
+    Source: OGC GeoTIFF 1.1, section 7.
+    """
+    start, size = _tags(data).get(GEO_KEYS, (0, 0))
+    order = "<" if data[:2] == b"II" else ">"
+    try:
+        words = struct.unpack_from(f"{order}{min(size, 4096)}H", data, start)
+    except struct.error:
+        return None
+    keys = {words[k]: words[k + 3] for k in range(4, len(words) - 3, 4) if words[k + 1] == 0 and words[k + 2] == 1}
+    code = keys.get(PROJECTED) or keys.get(GEOGRAPHIC)
+    return None if code in (None, 0, USER_DEFINED) else code
 
 
 def _tags(data: bytes) -> dict[int, tuple[int, int]]:
@@ -161,11 +184,16 @@ def read_tiff(data: bytes, limits: Limits) -> Raster:
         try:
             with MemoryFile(data) as file, file.open(driver="GTiff", GEOREF_SOURCES="INTERNAL") as dataset:
                 _check_size(dataset, limits)
-                return _decoded(dataset, rasterio)
+                raster = _decoded(dataset, rasterio)
         except BadUpload:
             raise
         except errors as error:
             raise UnreadableFile(f"the TIFF is damaged or of a kind that is not read: {_reason(error)}") from error
+    code = stated_code(data)
+    if code is not None and raster.crs in (None, LOCAL):  # what GDAL makes of a code that it does not know
+        reason = f"its GeoTIFF keys name EPSG:{code}, and no CRS that is known comes of them: correct them"
+        raise UnreadableFile(reason, [Problem(reason, where="crs")])
+    return raster
 
 
 def _check_size(dataset: Any, limits: Limits) -> None:
@@ -178,6 +206,8 @@ def _check_size(dataset: Any, limits: Limits) -> None:
             f"the TIFF says it has {width} × {height} = {width * height} pixels; the limit is {limits.pixels} "
             "(FLEETMAP_MAX_PIXELS)"
         )
+    if count > MAX_BANDS:
+        raise TooLarge(f"the TIFF says it has {count} bands; the limit is {MAX_BANDS}")
     if len(kinds) != 1 or kinds[0] not in DATA_TYPES:
         raise UnreadableFile(f"the TIFF's pixels are {', '.join(kinds)}; whole and floating numbers are read")
     size = width * height * count * np.dtype(kinds[0]).itemsize

@@ -26,7 +26,7 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Files, Limits, ReadContext, _xml
+from app.formats import Files, Limits, ReadContext, _fields, _xml
 from app.formats._text import number
 from app.model.frame import MAX_METRES
 from app.model.solids import matrix
@@ -101,12 +101,43 @@ def place_of(element: etree._Element) -> str:
 
 def parse(data: bytes, limits: Limits) -> etree._Element:
     """The ``<sdf>`` element without comments and indentation."""
-    if len(data) > limits.text_bytes:
-        raise TooLarge(f"the file has {len(data)} bytes of XML; the limit is {limits.text_bytes}")
     root = _xml.parse(data, limits, remove_blank_text=True)
     if root.tag != "sdf":
         raise wrong(f"the root element must be <sdf>, it is <{str(root.tag)[:80]}>", root)
     return root
+
+
+_EXTENTS = ("radius", "length", "size", "scale")
+_BOOLEANS = ("static", "self_collide", "allow_auto_disable", "cast_shadows")
+
+
+def warn_of_values(root: etree._Element, context: ReadContext) -> None:
+    """Report values that SDFormat reads but that hardly mean what they say: turns in degrees, sizes of zero."""
+    doubts: dict[str, list[etree._Element]] = {}
+    for pose in root.iter("pose"):
+        turned = pose.get("degrees") or pose.get("rotation_format")
+        angles = [] if turned else text_of(pose).split()[3:6]
+        if any(_FLOAT.match(a) and abs(float(a)) > _fields.ANGLE_USUAL for a in angles):
+            doubts.setdefault("a <pose> turned by more than 2π: are its angles in radians?", []).append(pose)
+    for name in _EXTENTS:
+        for extent in root.iter(name):
+            words = text_of(extent).split()
+            if (
+                words
+                and "geometry" in {a.tag for a in extent.iterancestors()}
+                and not any(_FLOAT.match(w) is None or float(w) for w in words)
+            ):
+                doubts.setdefault(f"a <{name}> of 0: the shape has no extent", []).append(extent)
+    for name in _BOOLEANS:
+        for flag in root.iter(name):
+            if text_of(flag).lower() not in ("0", "1", "true", "false"):
+                doubts.setdefault(f"<{name}> is {text_of(flag)[:40]!r}, which is taken for false", []).append(flag)
+    for reason, found in doubts.items():
+        often = f" ({len(found)} times)" if len(found) > 1 else ""
+        context.warn(f"{reason}{often}", line=found[0].sourceline, where=place_of(found[0]))
+
+
+_FLOAT = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?\Z", re.ASCII)
 
 
 def text_of(element: etree._Element | None, tag: str | None = None) -> str:

@@ -32,7 +32,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, ReadContext, WriteContext, _yaml, all_formats
+from app.formats import Files, ReadContext, WriteContext, _fields, _yaml, all_formats
+from app.formats._fields import ANY, COORDINATE, LENGTH, NOT_NEGATIVE, POINT, SPEED, Number, Quaternion, Text, record
 from app.formats._text import METRES, encoded, numbers
 from app.model.features import Features, Properties, from_columns, points, unique_ids
 from app.model.frame import GROUND
@@ -88,6 +89,37 @@ TRANSFORMATION = {
     "rotation": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0},
     "translation": {"x": 0.0, "y": 0.0, "z": 0.0},
 }
+
+_YAW = Number(0.0, 1e4, usual=(0.0, 10.0), hint="is it in radians?", unit="rad")
+_FREE = record(is_open=True, speed_limit=SPEED, width=LENGTH, xy_goal_tolerance=NOT_NEGATIVE, yaw_goal_tolerance=_YAW)
+_EDGE = record(
+    "action action_type config edge_id fail_policy fluid_navigation node recovery_behaviours_config map_2d",
+    goal=record(target_pose=record(is_open=True, pose=ANY)),
+    restrictions_planning=Text(),
+    restrictions_runtime=Text(),
+    properties=_FREE,
+    top_vel=SPEED,
+    inflation_radius=NOT_NEGATIVE,
+)
+_NODE = record(
+    "name parent_frame localise_by_topic map pointset",
+    edges=[_EDGE],
+    pose=record(position=POINT, orientation=Quaternion()),
+    properties=_FREE,
+    restrictions_planning=Text(),
+    restrictions_runtime=Text(),
+    verts=[record(x=COORDINATE, y=COORDINATE)],
+    xy_goal_tolerance=NOT_NEGATIVE,
+    yaw_goal_tolerance=_YAW,
+)
+_ENTRIES = [record(node=_NODE, meta=record(is_open=True))]
+SHAPE = record(
+    "metric_map name pointset verts",
+    meta=record(is_open=True),
+    transformation=record("child parent topo_map", rotation=Quaternion(), translation=POINT),
+    nodes=_ENTRIES,
+)
+"""What tmap2 files hold (the older list: its nodes). Source: topological_navigation's map files of all versions."""
 
 Array = NDArray[np.float64]
 
@@ -171,6 +203,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     rows, dangling = _edges(nodes, names, place, context)
     common = {"map": document.get("metric_map"), "pointset": document.get("pointset")}
     xyz, orientations = _poses(nodes, names)
+    _fields.check(top, _ENTRIES if legacy else SHAPE, context)
     _to_local(xyz, orientations, nodes, document, context)
     has_edges = bool(rows) or bool(dangling)
     kind = "node" if has_edges or not nodes else "poi"

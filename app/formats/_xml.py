@@ -6,8 +6,8 @@ import re
 
 from lxml import etree
 
-from app.errors import Problem, UnreadableFile
-from app.formats import Limits
+from app.errors import Problem, TooLarge, UnreadableFile
+from app.formats import Limits, ReadContext
 from app.model.prolog import check_prolog
 
 __all__ = ["MAX_ATTRIBUTES", "attributes", "check_bounds", "check_prolog", "parse"]
@@ -19,10 +19,13 @@ MAX_ATTRIBUTES = 256
 def parse(
     data: bytes, limits: Limits, *, keep_comments: bool = False, remove_blank_text: bool = False
 ) -> etree._Element:
-    """The root element. Raises UnreadableFile with the line, or XMLSyntaxError, which the read boundary explains.
+    """The root element. Raises TooLarge, UnreadableFile with the line, or XMLSyntaxError.
 
     remove_blank_text: leave out the white space that only indents (a third of the time and memory of such files).
     """
+    if len(data) > limits.text_bytes:
+        reason = f"{len(data)} bytes of XML; the limit for a text is {limits.text_bytes}"
+        raise TooLarge(reason, [Problem(reason)])
     check_prolog(data)
     parser = etree.XMLParser(
         resolve_entities=False,
@@ -39,6 +42,36 @@ def parse(
         raise UnreadableFile("a DOCTYPE is not accepted: remove it", [Problem("DOCTYPE is not accepted", line=1)])
     check_bounds(root, limits, None if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in data[:4] else data)
     return root
+
+
+_SCRIPT = "a script"
+_ACTIVE: tuple[tuple[str, re.Pattern[bytes]], ...] = (
+    ("a processing instruction", re.compile(rb"<\?(?!xml\s)[a-z_][\w.-]*")),
+    ("XInclude", re.compile(rb"http://www\.w3\.org/2001/xinclude")),
+    ("XSLT", re.compile(rb"http://www\.w3\.org/1999/xsl/transform")),
+    (_SCRIPT, re.compile(rb"(?:<|&lt;|&#60;|&#x3c;)(?:[\w-]+:)?script[\s>/&]|javascript:")),
+)
+_ACTIVE_WORDS = (b"<?", b"/2001/xinclude", b"/xsl/transform", b"script")
+
+
+def warn_of_active_content(data: bytes, context: ReadContext, *, has_scripts: bool = False) -> None:
+    """Report what some viewer of an XML file may run or fetch, and this server does not: each kind by name, once.
+
+    has_scripts: the format's own elements are called so (SDFormat's materials).
+    """
+    low = data.lower()
+    if b"\0" in low[:4]:  # UTF-16 or UTF-32: the words are ASCII
+        low = low.replace(b"\0", b"")
+    if not any(word in low[5:] for word in _ACTIVE_WORDS):
+        return
+    for what, pattern in _ACTIVE:
+        found = [m.start() for m in pattern.finditer(low)] if not (has_scripts and what == _SCRIPT) else []
+        if found:
+            shown = pattern.match(low, found[0])
+            name = "" if shown is None else f" {shown.group()[:60].decode('latin-1').strip()!r}"
+            often = f" ({len(found)} times)" if len(found) > 1 else ""
+            line = low.count(b"\n", 0, found[0]) + 1
+            context.warn(f"{what}{name}{often}: it is not run or followed here; a viewer may do so", line=line)
 
 
 def attributes(element: etree._Element) -> dict[str, str]:

@@ -23,10 +23,12 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _datum_rules, _yaml, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _datum_rules, _fields, _yaml, register
+from app.formats._fields import ANGLE, COORDINATE, LATITUDE, LONGITUDE, Number, Words, record
 from app.formats._text import DEGREES
 from app.model.features import Features, features
 from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum
+from app.model.geodesy import distance
 from app.model.grid import OccupancyGrid
 from app.model.layers import SITE, Layers, PartKey
 from app.parameters import parameter
@@ -55,6 +57,42 @@ class NavSat:
     use_odometry_yaw: bool = parameter(False, "of navsat_transform_node, where no source has it")
     wait_for_datum: bool = parameter(True, "of navsat_transform_node, where no source has it")
 
+
+_SIZE = record(xmin=COORDINATE, xmax=COORDINATE, ymin=COORDINATE, ymax=COORDINATE)
+_ALTITUDE = Number(-12_000.0, 100_000.0, unit="metres")
+_HEADING = Number(-360.0, 360.0, unit="degrees")
+_ORIGIN = record("name", latitude=LATITUDE, longitude=LONGITUDE, altitude=_ALTITUDE, heading=_HEADING)
+_BOOL = Words((True, False))
+SHAPE = record(
+    datum_latitude=LATITUDE,
+    datum_longitude=LONGITUDE,
+    datum_altitude=_ALTITUDE,
+    gnss_fence=record("gnss_fence_coords"),
+    gmapping=_SIZE,
+    mapviz_initialize_origin=record(local_xy_origins=[_ORIGIN], is_open=True),
+    navsat_transform_node=record(
+        "datum map_frame odom_frame base_link_frame world_frame cartesian_frame_id gps_frame",
+        frequency=Number(0.0, 1e4, above=True, unit="Hz"),
+        delay=Number(0.0, 1e4, unit="s"),
+        transform_timeout=Number(0.0, 1e4, unit="s"),
+        magnetic_declination_radians=ANGLE,
+        yaw_offset=ANGLE,
+        use_manual_datum=_BOOL,
+        use_local_cartesian=_BOOL,
+        broadcast_cartesian_transform=_BOOL,
+        broadcast_cartesian_transform_as_parent_frame=_BOOL,
+        zero_altitude=_BOOL,
+        broadcast_utm_transform=_BOOL,
+        broadcast_utm_transform_as_parent_frame=_BOOL,
+        publish_filtered_gps=_BOOL,
+        use_odometry_yaw=_BOOL,
+        wait_for_datum=_BOOL,
+    ),
+)
+"""What the file holds. Source: environment_template, robot_localization's navsat_transform_node, mapviz."""
+
+FAR_METRES = 100_000.0
+"""From the datum to a corner of the fence; beyond it the two are most likely not of one place."""
 
 NAVSAT = tuple(f.name for f in fields(NavSat))
 """Their names, in the template's order."""
@@ -91,6 +129,8 @@ def read(files: Files, context: ReadContext) -> Layers:
     altitude = _number(top.get("datum_altitude", 0.0), "datum_altitude")
     yaw = _yaw(top.get("navsat_transform_node") or {}, latitude, longitude, context)
     ring = _fence(top.get("gnss_fence"), context)
+    _fields.check(top, SHAPE, context)
+    _check_place(latitude, longitude, ring, context)
     document = {NAME: {key: value for key, value in top.items() if key not in ("gnss_fence", "datum_altitude")}}
     fence = top.get("gnss_fence")
     if isinstance(fence, dict) and len(fence) > 1:
@@ -103,6 +143,21 @@ def read(files: Files, context: ReadContext) -> Layers:
         rows.append((FENCE, shapely.Polygon(ring), properties))
     datum = Datum(latitude, longitude, altitude, _heading(yaw))
     return Layers({PartKey("location", context.level, SITE): features(rows, "wgs84", document)}, datum)
+
+
+def _check_place(latitude: float, longitude: float, ring: NDArray[np.float64] | None, context: ReadContext) -> None:
+    """Report a datum and a fence that hardly mean what they say."""
+    if latitude == longitude == 0.0:
+        context.warn("the datum is at 0, 0, in the sea: set the site's own place", where="datum_latitude")
+    if ring is None:
+        return
+    where = "gnss_fence.gnss_fence_coords"
+    far = [k for k, (x, y) in enumerate(ring.tolist()) if distance((longitude, latitude), (x, y)) > FAR_METRES]
+    if far:
+        reason = f"{len(far)} of {len(ring)} points are more than {FAR_METRES / 1000:g} km from the datum"
+        context.warn(f"{reason}: are latitude and longitude swapped?", where=f"{where}[{far[0]}]")
+    if not shapely.Polygon(ring).is_valid:
+        context.warn("the fence crosses itself: what is inside of it is not defined", where=where)
 
 
 def _refuse(reason: str, where: str) -> UnreadableFile:

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _yaml, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _yaml, register
+from app.formats._fields import COORDINATE, LENGTH, record
 from app.formats._network import (
     Array,
     checked_name,
@@ -49,6 +50,12 @@ DECIMALS = 6
 """Coordinates that agree to a micrometre are the same place."""
 
 AXES = ("x", "y", "z")
+_END = record(x=COORDINATE, y=COORDINATE)
+SHAPE = record(
+    internal_points=[record("name", x=COORDINATE, y=COORDINATE, z=COORDINATE)],
+    network_lines=[record("name", start=_END, end=_END, width=LENGTH)],
+)
+"""What the file holds."""
 
 
 # --- reading ---------------------------------------------------------------------------------------------------------
@@ -72,6 +79,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     if crowded:
         context.warn(f"{len(crowded)} points stand where another one does: {some(crowded)}; lines go to the first")
     found, dangling = _lines(top.get(LINES), place, context)
+    _fields.check(top, SHAPE, context)
     warn_lonely(len(names), (k for line in found for k in (line.a, line.b)), names, context)
     ids = unique_ids(map(identifier, names))
     properties: list[Properties] = []

@@ -137,6 +137,8 @@ def read(files: Files, context: ReadContext) -> Layers:
     if not _sdf.is_sdf(files[main]) and _sdf_lists.detect(main, files[main]):
         return _read_list(library, main, context)
     root = _sdf.parse(files[main], context.limits)
+    _xml.warn_of_active_content(files[main], context, has_scripts=True)
+    _sdf.warn_of_values(root, context)
     version = _sdf.version_of(root.get("version"))
     if version is None or not (1, 4) <= version <= _sdf.NEWEST:
         said = root.get("version")

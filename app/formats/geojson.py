@@ -104,6 +104,18 @@ def _refuse(reason: str, line: int | None = None, where: str | None = None) -> N
     raise UnreadableFile(f"{where}: {reason}" if where else reason, [Problem(reason, line=line, where=where)])
 
 
+def _is_box(box: Any) -> bool:
+    """Whether these are four or six numbers, corner after corner, within the earth's longitudes and latitudes."""
+    if not isinstance(box, list) or len(box) not in (4, 6):
+        return False
+    numbers = [float(v) for v in box if isinstance(v, (int, float)) and not isinstance(v, bool)]
+    if len(numbers) < len(box):
+        return False
+    half = len(numbers) // 2
+    west, south, east, north = numbers[0], numbers[1], numbers[half], numbers[half + 1]
+    return max(abs(west), abs(east)) <= 180.0 and -90.0 <= south <= north <= 90.0
+
+
 class _Reader:
     def __init__(self, data: bytes, top: Any, context: ReadContext) -> None:
         self.data = data
@@ -152,11 +164,12 @@ class _Reader:
 
     def _check_crs(self, crs: Any, where: str | None) -> None:
         """The ``crs`` of the 2008 specification: WGS 84 in longitude, latitude or nothing."""
-        if not isinstance(crs, dict):
+        if crs is None:
             return
-        properties = crs.get("properties")
+        properties = crs.get("properties") if isinstance(crs, dict) else None
         name = properties.get("name") if isinstance(properties, dict) else None
-        if isinstance(name, str) and not _EARTH.match(name):
+        name = name if isinstance(name, str) else orjson.dumps(crs).decode()
+        if not _EARTH.match(name) or "UTM" in name.upper():
             _refuse(
                 f"its coordinates are in {name[:80]}, but GeoJSON means degrees (WGS 84 longitude, latitude): export "
                 "it again in EPSG:4326 (a Nav2 route graph is the format nav2_route)",
@@ -166,7 +179,29 @@ class _Reader:
 
     # --- features ---
 
+    def warn_of_members(self) -> None:
+        """Report features without the members that every feature has, and a CRS of places that is not known."""
+        for word in ("geometry", "properties"):
+            lacking = [
+                k for k, row in enumerate(self.rows) if word not in row and not (word == "geometry" and "place" in row)
+            ]
+            if lacking:
+                reason = (
+                    f"{len(lacking)} features have no member {word!r}: each must have one, null where there is none"
+                )
+                self.context.warn(reason, line=self.line(lacking[0]), where=self.name(lacking[0]))
+        said = self.top.get("coordRefSys")
+        if said is not None and not self.local:
+            text = said if isinstance(said, str) else orjson.dumps(said).decode()
+            if not _EARTH.match(text):
+                reason = f"{text[:80]} is not known here: only geometry (WGS 84) counts, a place is left out"
+                self.context.warn(reason, where="coordRefSys")
+        box = self.top.get("bbox")
+        if box is not None and not _is_box(box):
+            self.context.warn("is no box [west, south, east, north] in degrees; it is kept", where="bbox")
+
     def layers(self) -> Layers:
+        self.warn_of_members()
         own = self.top.get(OWN)
         own = own if isinstance(own, dict) else {}
         network = self._network()

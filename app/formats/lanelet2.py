@@ -43,7 +43,7 @@ import numpy as np
 import shapely
 
 from app.errors import Invalid, MissingDatum, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _lanes, _osm_text, _yaml, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _lanes, _osm_text, _yaml, register
 from app.formats._lanes import Arm, Array, Border
 from app.formats._network import AMONG_PARTS, Edge, Net, joined, own
 from app.formats._osm import INT64, Data, Tags, Way, parse
@@ -58,6 +58,15 @@ from app.parameters import parameter
 NAME = "lanelet2"
 MAIN = "lanelet2.osm"
 PROJECTOR = "map_projector_info.yaml"
+_PROJECTORS = ("Local", "local", "MGRS", "LocalCartesian", "LocalCartesianUTM", "TransverseMercator")
+PROJECTOR_SHAPE = _fields.record(
+    "mgrs_grid",
+    projector_type=_fields.Words(_PROJECTORS),
+    vertical_datum=_fields.Words(("WGS84", "EGM2008")),
+    map_origin=_fields.record(latitude=_fields.LATITUDE, longitude=_fields.LONGITUDE, altitude=_fields.COORDINATE),
+    scale_factor=_fields.Number(0.0, 10.0, above=True),
+)
+"""What it holds. Source: autoware_map_projection_loader."""
 GENERATOR = "Fleet Map Server"
 
 EDGE, BACK, SOURCE, TARGET, NODE = (f"fleetmap:{w}" for w in ("edge", "back", "source", "target", "node"))
@@ -297,6 +306,10 @@ def _truth(value: str | None) -> bool | None:
 _SPEED = re.compile(r"\s*(\d{1,9}(?:\.\d{1,20})?)\s*([A-Za-z/]*)\s*", re.ASCII)
 
 
+MAX_SPEED = 150.0
+"""Metres per second; no vehicle's limit is higher."""
+
+
 def speed_of(text: str | None) -> float | None:
     """Metres per second, or None for what is no speed."""
     match = _SPEED.fullmatch(text or "")
@@ -384,6 +397,12 @@ def read(files: Files, context: ReadContext) -> Layers:
         said["bounds"] = data.bounds
     if data.elements:
         said["elements"] = [[name, attributes, text] for name, attributes, text in data.elements]
+    for relation in data.relations:
+        limit = relation.tags.get("speed_limit")
+        speed = None if limit is None else speed_of(limit)
+        if limit is not None and (speed is None or speed > MAX_SPEED):
+            reason = f"the speed limit {limit[:40]!r} is no speed from 0 to {MAX_SPEED:g} m/s"
+            context.warn(reason, where=f"relation {relation.id}")
     projector = next((n for n in files if n != context.main), None)
     local = _has_only_metres(data)
     if projector is not None:
@@ -421,6 +440,8 @@ def _projector_type(data: bytes, name: str, context: ReadContext) -> str:
     except UnreadableFile as error:
         problems = [Problem(p.problem, name, p.line, p.where) for p in error.problems]
         raise UnreadableFile(f"{name}: {error.detail}", problems) from error
+    if isinstance(said, dict):
+        _fields.check(said, PROJECTOR_SHAPE, context, name)
     kind = said.get("projector_type") if isinstance(said, dict) else None
     if not isinstance(kind, str):
         context.warn("it names no projector_type: places on earth are believed", file=name)

@@ -28,7 +28,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _json, _lif_rules, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _json, _lif_rules, register
+from app.formats._fields import ANGLE, COORDINATE, NOT_NEGATIVE, SPEED, Number, Words, record
 from app.formats._network import (
     AMONG_PARTS,
     SAME_ANGLE,
@@ -74,6 +75,56 @@ ORDER = _json.ranks(
 """How the keys follow each other, as in the specification."""
 
 LISTS = frozenset({"nodes", "edges", "stations"})
+_ACTION = record(
+    "actionType actionDescription actionParameters",
+    requirementType=Words(("REQUIRED", "CONDITIONAL", "OPTIONAL")),
+    blockingType=Words(("NONE", "SOFT", "HARD")),
+)
+_TRAJECTORY = record(
+    degree=Number(1.0, 1000.0),
+    knotVector=[Number(0.0, 1e6)],
+    controlPoints=[record(x=COORDINATE, y=COORDINATE, weight=Number(0.0, 1e9, above=True))],
+)
+_NODE = record(
+    "nodeId nodeName nodeDescription mapId",
+    nodePosition=record(x=COORDINATE, y=COORDINATE),
+    vehicleTypeNodeProperties=[record("vehicleTypeId", theta=Number(-1e4, 1e4), actions=[_ACTION])],
+)
+_EDGE = record(
+    "edgeId edgeName edgeDescription startNodeId endNodeId",
+    vehicleTypeEdgeProperties=[
+        record(
+            "vehicleTypeId rotationAllowed rotationAtStartNodeAllowed rotationAtEndNodeAllowed loadRestriction "
+            "reentryAllowed",
+            vehicleOrientation=Number(-1e4, 1e4, usual=(-360.0, 360.0), hint="it is beyond a full turn"),
+            orientationType=Words(("GLOBAL", "TANGENTIAL")),
+            maxSpeed=SPEED,
+            maxRotationSpeed=Number(0.0, 1000.0, unit="rad/s"),
+            minHeight=COORDINATE,
+            maxHeight=COORDINATE,
+            trajectory=_TRAJECTORY,
+            actions=[_ACTION],
+        )
+    ],
+)
+_STATION = record(
+    "stationId stationName stationDescription interactionNodeIds",
+    stationHeight=NOT_NEGATIVE,
+    stationPosition=record(x=COORDINATE, y=COORDINATE, theta=ANGLE),
+)
+SHAPE = record(
+    metaInformation=record("projectIdentification creator exportTimestamp lifVersion"),
+    layouts=[
+        record(
+            "layoutId layoutName layoutVersion layoutLevelId layoutDescription",
+            nodes=[_NODE],
+            edges=[_EDGE],
+            stations=[_STATION],
+        )
+    ],
+)
+"""What a file of version 1 holds. Source: VDMA LIF 1.0.0, section 8."""
+
 CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME}) | AMONG_PARTS
 CANONICAL_EDGE = frozenset({"kind", "name", "source", "target", "speed_limit", NAME}) | AMONG_PARTS
 CANONICAL_STATION = frozenset({"kind", "name", NAME}) | AMONG_PARTS
@@ -125,7 +176,11 @@ def read(files: Files, context: ReadContext) -> Layers:
     if not isinstance(top, dict) or not isinstance(top.get("layouts", top.get("origins")), list):
         reason = "a LIF file is one object with an array of layouts"
         raise UnreadableFile(reason, [Problem(reason, where="layouts")])
-    return _Reader(top, context).layers()
+    reader = _Reader(top, context)
+    layers = reader.layers()
+    if reader.is_first:  # drafts of version 2 have other members in each revision
+        _fields.check(top, SHAPE, context)
+    return layers
 
 
 @dataclass(slots=True)
@@ -153,6 +208,7 @@ class _Level:
 class _Reader:
     def __init__(self, top: dict[str, Any], context: ReadContext) -> None:
         self.top, self.context = top, context
+        self.is_first = "origins" not in top
         self.doubts: Counter[str] = Counter()
         self.heads: list[dict[str, Any]] = []
         self.found: dict[str, list[_Item]] = {kind: [] for kind in ("node", "edge", "station")}
@@ -168,11 +224,13 @@ class _Reader:
             raise TooLarge(f"the file has {total} items; the limit is {context.limits.features}")
 
     def version(self) -> None:
+        """Report a version that is not known, or missing."""
         meta = self.top.get("metaInformation")
         said = meta.get("lifVersion") if isinstance(meta, dict) else None
         if not isinstance(said, str):
             self.context.warn("is missing; it is read as version 1.0", where="metaInformation.lifVersion")
         elif said.split(".")[0] not in ("0", "1"):
+            self.is_first = False
             self.context.warn(
                 f"version {said[:40]} is a draft, read as far as it is known; it is served as it came",
                 where="metaInformation.lifVersion",

@@ -21,7 +21,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import CannotConvert, Problem, TooLarge, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _json, _nav2_route_rules, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _json, _nav2_route_rules, register
+from app.formats._fields import NOT_NEGATIVE, SPEED, Number, Words, record
 from app.formats._network import (
     AMONG_PARTS,
     Array,
@@ -79,6 +80,28 @@ class WriteOptions:
     frame_id: str = parameter(FRAME, "frame of nodes whose source names none")
 
 
+_SPEED, _LENGTH = replace(SPEED, or_other=True), replace(NOT_NEGATIVE, or_other=True)
+_METADATA = record(
+    is_open=True,
+    is_loose=True,
+    speed_limit=_SPEED,
+    abs_speed_limit=_SPEED,
+    penalty=_LENGTH,
+    abs_time_taken=_LENGTH,
+    width=_LENGTH,
+)
+_FEATURE = record(
+    is_open=True,
+    type=Words(("Feature",)),
+    properties=record(
+        "id startid endid overridable frame operations graph_id",
+        metadata=_METADATA,
+        cost=Number(0.0, 1e9, or_other=True),
+    ),
+)
+SHAPE = record(is_open=True, type=Words(("FeatureCollection",)), features=[_FEATURE])
+"""What a graph holds. Source: nav2_route, GeoJsonGraphFileLoader; members beside these are GeoJSON's or QGIS'."""
+
 CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}
 """What Nav2's own graphs say, so that QGIS shows their metres; the route server does not look at it."""
 
@@ -101,7 +124,9 @@ def read(files: Files, context: ReadContext) -> Layers:
         )
     if len(rows) > context.limits.features:
         raise TooLarge(f"the file has {len(rows)} features; the limit is {context.limits.features}")
-    return _Reader(top, rows, context).layers()
+    layers = _Reader(top, rows, context).layers()
+    _fields.check(top, SHAPE, context)
+    return layers
 
 
 class _Reader:

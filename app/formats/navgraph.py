@@ -27,7 +27,8 @@ import numpy as np
 import shapely
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _navgraph_rules, _yaml, register
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _navgraph_rules, _yaml, register
+from app.formats._fields import ANGLE, COORDINATE, Number, Record, record
 from app.formats._network import (
     AMONG_PARTS,
     Array,
@@ -75,6 +76,27 @@ NODE_KEYS = frozenset({"name", "pos", "properties"})
 CANONICAL_NODE = frozenset({"kind", "name", "orientation", NAME}) | AMONG_PARTS
 CANONICAL_EDGE = frozenset({"kind", "source", "target", NAME}) | AMONG_PARTS
 
+_TOLERANCE = Number(0.0, 1e4)
+_PROPERTIES = [
+    record(
+        is_open=True,
+        is_loose=True,
+        orientation=ANGLE,
+        travel_tolerance=_TOLERANCE,
+        target_tolerance=_TOLERANCE,
+        orientation_tolerance=_TOLERANCE,
+        shortcut_tolerance=_TOLERANCE,
+    )
+]
+SHAPE = Record(
+    {
+        **dict.fromkeys(("graph-name", "root", "connections")),
+        "default-properties": _PROPERTIES,
+        "nodes": [record("name", pos=(COORDINATE, COORDINATE), properties=_PROPERTIES)],
+    }
+)
+"""What a navgraph holds. Source: Fawkes, libs/navgraph/yaml_navgraph.cpp."""
+
 MANY_CROSSINGS = 50
 """Crossings a connection on average: a network with more is a scribble, and each is taken for crossing."""
 
@@ -91,6 +113,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     if not isinstance(top, dict) or not isinstance(top.get("nodes"), list):
         raise UnreadableFile("there is no list of nodes: not a navgraph", [Problem("no list", where="nodes")])
     nodes = [_Read(item, k, context) for k, item in enumerate(top["nodes"])]
+    _fields.check(top, SHAPE, context)
     names = [node.name for node in nodes]
     ids = unique_ids(map(identifier, names))
     if again := without_repeats(names):

@@ -33,6 +33,7 @@ from app.formats import (
     Parts,
     ReadContext,
     WriteContext,
+    _fields,
     _image,
     _masks,
     _occupancy_grid_rules,
@@ -47,6 +48,15 @@ from app.parameters import parameter
 
 NAME = "occupancy_grid"
 MODES: tuple[Mode, ...] = ("trinary", "scale", "raw")
+SHAPE = _fields.record(
+    "image mode negate occupied_thresh free_thresh map_type",
+    resolution=_fields.Number(
+        1e-6, 1e4, usual=(1e-3, 10.0), hint="a cell this large holds a room; is it in metres?", unit="metres"
+    ),
+    origin=(_fields.COORDINATE, _fields.COORDINATE, replace(_fields.ANGLE, low=-MAX_METRES, high=MAX_METRES)),
+)
+"""What a map's YAML holds. Source: Nav2's map_io, slam_toolbox."""
+
 KEYS = ("image", "mode", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 YAML_ENDS = (".yaml", ".yml")
@@ -230,7 +240,7 @@ def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadConte
     if "negate" not in missing:
         negate = document["negate"]
         number = _number(negate)
-        if isinstance(negate, bool) or (number is not None and number.is_integer()):
+        if isinstance(negate, bool) or number in (0.0, 1.0):
             said["negate"] = bool(negate if isinstance(negate, bool) else number)
         else:
             wrong("negate", f"negate must be 0, 1, true or false, got {_shown(negate)}")
@@ -250,6 +260,7 @@ def _read_yaml(files: Files, main: str, options: ReadOptions, context: ReadConte
     if said["free_thresh"] > said["occupied_thresh"]:
         reason = "free_thresh is above occupied_thresh: where both hold a cell is free"
         context.warn(reason, file=main, line=_line(data, "free_thresh"), where="free_thresh")
+    _fields.check(document, SHAPE, context)
     extra = {key: value for key, value in document.items() if key not in KEYS}
     if "mode" in document:
         said["mode"] = document["mode"]

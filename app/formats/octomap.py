@@ -281,8 +281,9 @@ def _read_full(
         node, octant = _children(masks[rows])
         codes = codes[node] << np.uint64(3) | octant
     odds = nodes["odds"][leaf].astype(np.float32) + np.float32(0.0)
-    if not bool(np.isfinite(odds).all()):
-        at = int(np.flatnonzero(leaf)[np.flatnonzero(~np.isfinite(odds))[0]])
+    infinite = np.flatnonzero(~np.isfinite(nodes["odds"]))
+    if len(infinite):
+        at = int(infinite[0])
         raise _wrong(f"the log-odds of node {at} are no finite number", where="data")
     colour = np.ascontiguousarray(nodes["colour"][leaf]) if header.id == COLOR_OCTREE else None
     if len(nodes) == 1:  # the whole tree is one leaf: its eight octants

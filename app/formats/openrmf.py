@@ -37,14 +37,16 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.errors import MissingLayer
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _openrmf_rules, _rmf, _yaml, register
+from app.errors import Invalid, MissingLayer
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _openrmf_rules, _rmf, _yaml, register
+from app.formats._fields import ANGLE, ANY, COORDINATE, LENGTH, NOT_NEGATIVE, SPEED, Number, Typed, Words, record
 from app.formats._network import own
 from app.formats._rmf import BUILDING, NAV_GRAPH, Array, Flow, Storey, index, listing, mapping, number, refuse, value_of
 from app.formats._rmf_images import companions_of, images, stored
 from app.formats._text import DEGREES, METRES, encoded, numbers
 from app.model.features import Features, Properties, alike, features, from_columns, points, segments, unique_ids
 from app.model.frame import GROUND, Level
+from app.model.geodesy import check_crs
 from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
 
 NAME = BUILDING
@@ -87,6 +89,94 @@ MAX_FIDUCIALS = 200
 """In common between two levels; each is compared with each."""
 
 _EARTH_TURN = 180.0 / 128.0
+
+
+_LANE = record(
+    "mutex demo_mock_floor_name demo_mock_lift_name dock_name",
+    bidirectional=Typed(Words((True, False))),
+    graph_idx=Typed(Number(0, 1000)),
+    orientation=Typed(Words(("", "forward", "backward"))),
+    speed_limit=Typed(SPEED),
+    width=Typed(NOT_NEGATIVE),
+)
+_WALL = record(
+    "texture_name",
+    alpha=Typed(Number(0.0, 1.0)),
+    texture_height=Typed(NOT_NEGATIVE),
+    texture_scale=Typed(NOT_NEGATIVE),
+    texture_width=Typed(NOT_NEGATIVE),
+)
+_DOOR = record(
+    "name motion_axis plugin",
+    motion_degrees=Typed(Number(-360.0, 360.0, unit="degrees")),
+    motion_direction=Typed(Number(-1, 1)),
+    right_left_ratio=Typed(NOT_NEGATIVE),
+    type=Typed(Words(("hinged", "double_hinged", "sliding", "double_sliding", "telescope", "double_telescope"))),
+)
+_VERTEX = record(
+    "is_charger is_holding_point is_parking_spot is_passthrough_point is_cleaning_zone dock_name mutex lift_cabin "
+    "spawn_robot_name spawn_robot_type pickup_dispenser dropoff_ingestor human_goal_set_name",
+    merge_radius=Typed(Number(0.0, 1000.0, unit="metres")),
+)
+_RING = record(
+    "vertices",
+    parameters=record(
+        "indoor ceiling_texture texture_name",
+        texture_rotation=Typed(Number(-360.0, 360.0, unit="degrees")),
+        texture_scale=Typed(NOT_NEGATIVE),
+        ceiling_scale=Typed(NOT_NEGATIVE),
+    ),
+)
+_LAYER = record(
+    "features filename visible",
+    color=[Number(0.0, 1.0)],
+    transform=record(
+        scale=Number(SMALLEST, 1 / SMALLEST, unit="metres per pixel"),
+        translation_x=COORDINATE,
+        translation_y=COORDINATE,
+        yaw=ANGLE,
+    ),
+)
+_LEVEL = record(
+    "constraints drawing features fiducials lights physical_cameras",
+    doors=[(ANY, ANY, _DOOR)],
+    elevation=COORDINATE,
+    flattened_x_offset=COORDINATE,
+    flattened_y_offset=COORDINATE,
+    floors=[_RING],
+    holes=[_RING],
+    human_lanes=[(ANY, ANY, _LANE)],
+    lanes=[(ANY, ANY, _LANE)],
+    layers=record(each=_LAYER),
+    measurements=[(ANY, ANY, record(distance=Typed(COORDINATE)))],
+    models=[
+        record("model_name name static dispensable lift_cabin", x=COORDINATE, y=COORDINATE, z=COORDINATE, yaw=ANGLE)
+    ],
+    vertices=[(COORDINATE, COORDINATE, COORDINATE, ANY, _VERTEX)],
+    walls=[(ANY, ANY, _WALL)],
+    x_meters=COORDINATE,
+    y_meters=COORDINATE,
+)
+_LIFT = record(
+    "highest_floor initial_floor_name level_doors lowest_floor plugins reference_floor_name",
+    depth=LENGTH,
+    width=LENGTH,
+    x=COORDINATE,
+    y=COORDINATE,
+    yaw=ANGLE,
+    doors=record(
+        each=record(door_type=Number(0, 100), motion_axis_orientation=ANGLE, width=LENGTH, x=COORDINATE, y=COORDINATE)
+    ),
+)
+SHAPE = record(
+    "coordinate_system crowd_sim graphs name reference_level_name",
+    parameters=record(
+        "generate_crs", suggested_offset_x=Typed(Number(-1e9, 1e9)), suggested_offset_y=Typed(Number(-1e9, 1e9))
+    ),
+    levels=record(each=_LEVEL),
+    lifts=record(each=_LIFT),
+)
+"""What a building holds. Source: rmf_traffic_editor's files, and rmf_building_map_tools that reads them."""
 
 
 # --- from the file's numbers to metres or degrees, and back -----------------------------------------------------------
@@ -236,6 +326,8 @@ def read(files: Files, context: ReadContext) -> Layers:
     top = _yaml.load(files[main], context.limits)
     if not isinstance(top, dict):
         refuse("must be a mapping with levels", "")
+    _fields.check(top, SHAPE, context)
+    _check_crs(top.get("parameters"))
     said = mapping(top.get("levels"), "levels")
     if not said:
         refuse("a building needs at least one level", "levels")
@@ -280,6 +372,16 @@ def read(files: Files, context: ReadContext) -> Layers:
         parts[PartKey("resources", GROUND, NAME)] = Resources(found_images)
     parts = {key: part for key, part in parts.items() if context.wants(key.layer)}
     return Layers(parts, None, tuple(Level(level.name, level.elevation) for level in levels.values()))
+
+
+def _check_crs(parameters: Any) -> None:
+    """Refuse a building whose coordinates are said to be of a CRS that does not exist."""
+    said = value_of(parameters, "generate_crs") if isinstance(parameters, dict) else None
+    if said not in (None, ""):
+        try:
+            check_crs(str(said))
+        except Invalid as error:
+            refuse(error.detail, "parameters.generate_crs")
 
 
 def _level(name: str, order: int, said: Any) -> _Level:

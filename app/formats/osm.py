@@ -44,7 +44,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
-from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext, _osm_rules, _osm_text, register
+from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext, _osm_rules, _osm_text, _xml, register
 from app.formats._osm import INT64, Attributes, Data, Tags, Way, is_pbf, parse, unpack
 from app.formats._osm_text import NOTHING, Node, as_texts, attribute_text, element_id, integers, plain
 from app.formats._text import DEGREES, numbers
@@ -262,12 +262,17 @@ _FIRST = re.compile(rb"(?s)\s*+(?>(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*)(?:<osm[\s/>
 _GZIP = tuple(b"\x1f\x8b" + bytes([k]) for k in (8,))
 
 
+PROLOG_BYTES = 2**14
+"""Of a file's beginning, where stylesheets are named; elements of other formats are refused anywhere."""
+
+
 def read(files: Files, context: ReadContext) -> Layers:
     """A highway network and all other elements as objects, on earth.
 
     Raises UnreadableFile, with a line where there is one, for what is no OSM file and for places that are not on earth.
     """
     topology, objects = context.wants("topology"), context.wants("objects")
+    _xml.warn_of_active_content(files[context.main][:PROLOG_BYTES], context, has_scripts=True)
     data = parse(files[context.main], context.limits, highways_only=not objects)
     for problem, line, where in data.problems:
         context.warn(problem, line=line, where=where)

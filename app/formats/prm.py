@@ -27,7 +27,8 @@ from typing import Any
 import numpy as np
 
 from app.errors import FleetMapError, Problem, UnreadableFile
-from app.formats import BAD_INPUT, Files, Format, Needs, ReadContext, WriteContext, _image, _yaml, register
+from app.formats import BAD_INPUT, Files, Format, Needs, ReadContext, WriteContext, _fields, _image, _yaml, register
+from app.formats._fields import NOT_NEGATIVE, Number, record
 from app.formats._network import (
     Array,
     Net,
@@ -56,6 +57,14 @@ NAME = "prm"
 FILE = "prm.yaml"
 PICTURE = "picture"
 OWN_KEYS = ("nodes", "edges", PICTURE)
+_PIXEL = Number(-1e12, 1e12)
+SHAPE = record(
+    "picture",
+    nodes=[record("id name", x=_PIXEL, y=_PIXEL)],
+    edges=[record("from to", weight=NOT_NEGATIVE)],
+)
+"""What a roadmap holds."""
+
 WHOLE = 1e-4
 """A pixel this near to a whole one is that one: metres are kept to a nanometre."""
 
@@ -129,6 +138,7 @@ def read(files: Files, context: ReadContext) -> Layers:
         context.warn(f"{len(again)} ids stand twice or more: {some(again)}; edges to them go to the first")
     if len(pixels) and (pixels.min() < -0.5 or pixels[:, 1].max() > picture.height - 0.5):
         context.warn(f"some nodes lie outside the map's picture ({picture.height} rows)")
+    _fields.check(top, SHAPE, context)
     place = {name: k for k, name in reversed(list(enumerate(names)))}
     ids = unique_ids(map(identifier, names))
     xyz = np.concatenate([picture.metres(pixels), np.zeros((len(names), 1))], axis=1)

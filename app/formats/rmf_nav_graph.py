@@ -31,7 +31,19 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import MissingLayer
-from app.formats import Files, Format, Needs, ReadContext, WriteContext, _rmf, _rmf_nav_graph_rules, _yaml, register
+from app.formats import (
+    Files,
+    Format,
+    Needs,
+    ReadContext,
+    WriteContext,
+    _fields,
+    _rmf,
+    _rmf_nav_graph_rules,
+    _yaml,
+    register,
+)
+from app.formats._fields import ANGLE, ANY, COORDINATE, LENGTH, SPEED, Number, Words, record
 from app.formats._network import own
 from app.formats._rmf import (
     BUILDING,
@@ -66,6 +78,24 @@ SHARED = 4096
 ROWS = 10_000
 """Lines that are turned into bytes at once."""
 
+_VERTEX = record(
+    "name is_charger is_holding_point is_parking_spot is_passthrough_point is_cleaning_zone dock_name mutex lift "
+    "lift_cabin spawn_robot_name spawn_robot_type pickup_dispenser dropoff_ingestor human_goal_set_name",
+    merge_radius=Number(0.0, 1000.0, unit="metres"),
+)
+_LANE = record(
+    "dock_name mutex door_name is_bidirectional demo_mock_floor_name demo_mock_lift_name",
+    orientation_constraint=Words(("forward", "backward")),
+    speed_limit=SPEED,
+)
+SHAPE = record(
+    "building_name",
+    levels=record(each=record(vertices=[(COORDINATE, COORDINATE, _VERTEX)], lanes=[(ANY, ANY, _LANE)])),
+    doors=record(each=record("map", endpoints=[[COORDINATE]])),
+    lifts=record(each=record(position=(COORDINATE, COORDINATE, ANGLE), dims=[LENGTH])),
+)
+"""What a graph holds. Source: rmf_building_map_tools (building_map/generate_nav), rmf_fleet_adapter's parse_graph."""
+
 LANE_WORDS = ("mutex", "demo_mock_floor_name", "demo_mock_lift_name")
 """A building's lane parameters that a graph takes over as they are, where they are not empty."""
 
@@ -94,6 +124,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     doors: dict[str, tuple[Any, list[int], int]] = {}
     lifts: dict[str, tuple[Any, list[int], int]] = {}
     for graph in graphs:
+        _fields.check(graphs[graph], SHAPE, context)
         top, graphs[graph] = graphs[graph], {}  # what was parsed is let go before the features are made
         tops[str(graph)] = {key: value for key, value in top.items() if key not in ("levels", "doors", "lifts")}
         for name, said in mapping(top.get("levels"), "levels").items():

@@ -196,6 +196,14 @@ def crs_to_wgs84(crs: str, points: Array) -> Array:
     return out
 
 
+def check_crs(crs: str) -> None:
+    """Raise Invalid for a CRS (a code or WKT) that PROJ does not know."""
+    try:
+        CRS.from_user_input(crs)
+    except ProjError as error:
+        raise Invalid(f"the CRS {_short(crs)!r} does not exist: name one like EPSG:32632") from error
+
+
 @lru_cache(maxsize=64)
 def _vertical_unit(crs: str) -> float:
     """Metres of one unit of height; 1 where the CRS does not say."""

@@ -77,7 +77,8 @@ def test_every_real_file_comes_back_the_same(shared: Path, same: Same, facts_jso
         data = path.read_bytes()
         assert formats.detect(path.name, data) is FORMAT
         layers, context = read(data)
-        assert context.warnings == []
+        crossing = "general_east_pathway" in str(path)
+        assert ["crosses itself" in w.problem for w in context.warnings] == [True] * crossing, path
         served, told = write(layers)
         assert same("datum", {"datum.yaml": data}, {"datum.yaml": served}) == [], path
         assert (told.dropped, told.template, told.warnings) == ([], [], [])

@@ -222,7 +222,7 @@ def test_lies_in_headers_are_found_before_anything_is_allocated(data: bytes, sai
 def test_limits_are_kept() -> None:
     with pytest.raises(TooLarge, match="limit is 2"):
         read(FIELD, limits=Limits(voxels=2))
-    with pytest.raises(TooLarge, match="bytes; the limit"):
+    with pytest.raises(TooLarge, match="which is the limit"):
         read(SPIRAL, limits=Limits(unpacked_bytes=100))
 
 

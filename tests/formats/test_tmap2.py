@@ -599,7 +599,7 @@ def broken(change: Callable[[dict[str, Any]], Any]) -> str:
         (lambda t: t["nodes"][0]["node"]["pose"]["position"].update(y=True), "A.pose.position"),
         (lambda t: t["nodes"][0]["node"]["pose"]["position"].update(y=None), "A.pose.position"),
         (lambda t: t["nodes"][0]["node"]["pose"]["position"].update(y=[1]), "A.pose.position"),
-        (lambda t: t["nodes"][0]["node"]["pose"]["position"].update(y=1e300), "A"),
+        (lambda t: t["nodes"][0]["node"]["pose"]["position"].update(y=1e300), "nodes[0].node.pose.position.y"),
         (lambda t: t["nodes"][0]["node"]["pose"]["orientation"].pop("w"), "A.pose"),
         (lambda t: t["nodes"][0]["node"]["pose"]["orientation"].update(w="up"), "A.pose.orientation"),
         (lambda t: t.update(transformation={"child": "c", "rotation": {"w": 0}}), "transformation.rotation"),

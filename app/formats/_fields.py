@@ -1,0 +1,262 @@
+"""The values that a YAML or JSON file may hold: declared once for each format, checked in one walk.
+
+A shape is ``ANY``, a rule for a value, a list with the shape of each item, or a ``Record``: keys with their shapes.
+Values out of range are refused with their place. Unknown keys, and values that hardly mean what they say, are
+reported by name: one warning for all of a kind. Absent keys and nulls are the reader's business.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from app.errors import Problem, UnreadableFile
+from app.formats import ReadContext, _yaml
+from app.model.frame import MAX_METRES
+
+MAX_FINDINGS = 1000
+SHOWN = 6
+"""Names that one warning lists."""
+
+ANY: Final = None
+"""The shape of what is not checked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A finite number from ``low`` to ``high``, also one in quotes; outside of ``usual`` it is doubtful.
+
+    above: the number must be larger than ``low``. hint: what a doubtful number may mean instead. or_other: values of
+    other types are the reader's business.
+    """
+
+    low: float = -MAX_METRES
+    high: float = MAX_METRES
+    above: bool = False
+    usual: tuple[float, float] | None = None
+    hint: str = ""
+    unit: str = ""
+    or_other: bool = False
+
+    def check(self, value: Any) -> tuple[str, str]:
+        """Return why the value is refused, and why it is doubtful; empty texts if it is not."""
+        number = _number(value)
+        unit = f" {self.unit}" if self.unit else ""
+        if number is None and self.or_other:
+            return "", ""
+        if number is None:
+            return f"must be a number{unit and ' of' + unit}, is {_shown(value)}", ""
+        if not self.low <= number <= self.high or (self.above and number == self.low):
+            bounds = f"above {self.low:g} and at most" if self.above else f"from {self.low:g} to"
+            return f"must be {bounds} {self.high:g}{unit}, is {_shown(value)}", ""
+        if self.usual and not self.usual[0] <= number <= self.usual[1]:
+            return "", f"{_shown(value)}{unit} is unusual: {self.hint}"
+        return "", ""
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """One of a closed set of texts (or truth values); others are doubtful."""
+
+    known: tuple[Any, ...]
+
+    def check(self, value: Any) -> tuple[str, str]:
+        """Return why the value is doubtful."""
+        if any(value == word and type(value) is type(word) for word in self.known):
+            return "", ""
+        return "", f"unknown value {_shown(value)}: it is one of {', '.join(map(str, self.known))}"
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A text that is no code: words, their combinations by and, or, not, and comparisons."""
+
+    def check(self, value: Any) -> tuple[str, str]:
+        """Return why the value is doubtful."""
+        if not isinstance(value, str) or (_CONDITION.fullmatch(value) and not _CALL.search(value)):
+            return "", ""
+        return "", f"{_shown(value)} is no condition of words: a planner that evaluates it runs it as code"
+
+
+_CONDITION = re.compile(r"[\w\s&|~!()=<>'\",.:/+*-]*")
+_CALL = re.compile(r"(?!\b(?:and|or|not|in)\s*\()[\w\])'\"]\s*\(|__|\blambda\b|\bimport\b|\*\*")
+
+
+@dataclass(frozen=True, slots=True)
+class Quaternion:
+    """A mapping x, y, z, w of length 1; others are doubtful (old files leave them all 0)."""
+
+    def check(self, value: Any) -> tuple[str, str]:
+        """Return why the value is refused, and why it is doubtful."""
+        parts = [_number(value.get(axis, 0.0)) for axis in "xyzw"] if isinstance(value, dict) else [None]
+        numbers = [part for part in parts if part is not None]
+        if len(numbers) < 4:
+            return f"must be a mapping of numbers x, y, z, w, is {_shown(value)}", ""
+        length = math.hypot(*numbers)
+        return "", "" if abs(length - 1.0) < 0.01 else f"a quaternion of length {length:g}: it must be 1"
+
+
+@dataclass(frozen=True, slots=True)
+class Typed:
+    """Open-RMF's parameters: [type, value], with the shape of the value."""
+
+    shape: Any
+
+
+@dataclass(frozen=True)
+class Record:
+    """A mapping. each: the shape of keys that are not listed, names of the user's own; without it they are unknown.
+
+    open: keys that are not listed may be anything. loose: so may values that are no mapping.
+    """
+
+    keys: Mapping[str, Any]
+    each: Any = ANY
+    open: bool = False
+    loose: bool = False
+    known: frozenset[str] = field(init=False)
+    rules: tuple[tuple[str, Any], ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "known", frozenset(self.keys))
+        object.__setattr__(self, "rules", tuple((k, s) for k, s in self.keys.items() if s is not ANY))
+
+
+def record(names: str = "", each: Any = ANY, *, is_open: bool = False, is_loose: bool = False, **keys: Any) -> Record:
+    """Build a mapping's shape. names: keys whose values are not checked, separated by blanks."""
+    return Record({**dict.fromkeys(names.split()), **keys}, each, is_open, is_loose)
+
+
+LATITUDE = Number(-90.0, 90.0, unit="degrees")
+LONGITUDE = Number(-180.0, 180.0, unit="degrees")
+COORDINATE = Number(unit="metres")
+LENGTH = Number(0.0, MAX_METRES, above=True, unit="metres")
+NOT_NEGATIVE = Number(0.0, MAX_METRES)
+SPEED = Number(0.0, 1000.0, usual=(0.0, 50.0), hint="is it in metres per second?", unit="m/s")
+ANGLE_USUAL = 6.3
+"""Radians: a full turn. What is beyond it may be degrees."""
+
+ANGLE = Number(-1e4, 1e4, usual=(-ANGLE_USUAL, ANGLE_USUAL), hint="is it in radians?", unit="rad")
+POINT = record(x=COORDINATE, y=COORDINATE, z=COORDINATE)
+
+Path = tuple[Any, ...]
+"""Keys and indexes from the inside out: (key, (key of the parent, …))."""
+
+
+def check(value: Any, shape: Any, context: ReadContext, file: str | None = None) -> None:
+    """Check a file's value against its shape; see the module. file: default: the main file.
+
+    Raises UnreadableFile for the first value that is out of range.
+    """
+    found = _Findings(file)
+    _walk(value, shape, (), found)
+    found.report(context)
+
+
+class _Findings:
+    """What is reported after the walk: places by reason."""
+
+    def __init__(self, file: str | None) -> None:
+        self.file = file
+        self.unknown: dict[str, int] = {}
+        self.doubts: dict[tuple[str, str], list[Any]] = {}
+
+    def add_unknown(self, path: Path, keys: frozenset[str]) -> None:
+        for key in sorted(keys):
+            name = _pattern((key, path))[:120]
+            if name in self.unknown or len(self.unknown) < MAX_FINDINGS:
+                self.unknown[name] = self.unknown.get(name, 0) + 1
+
+    def add_doubt(self, path: Path, reason: str) -> None:
+        key = _pattern(path), re.sub(r"^(unknown value )?('[^']*'|\S+)", "", reason)
+        if key in self.doubts:
+            self.doubts[key][0] += 1
+        elif len(self.doubts) < MAX_FINDINGS:
+            self.doubts[key] = [1, _where(path), reason]
+
+    def report(self, context: ReadContext) -> None:
+        if self.unknown:
+            names = [name if n == 1 else f"{name} ({n} times)" for name, n in list(self.unknown.items())[:SHOWN]]
+            more = len(self.unknown) - SHOWN
+            names += [f"and {more} more"] if more > 0 else []
+            context.warn(f"unknown keys, kept without effect: {', '.join(names)}", file=self.file)
+        for count, where, reason in self.doubts.values():
+            context.warn(reason if count == 1 else f"{reason} ({count} times)", file=self.file, where=where)
+
+
+def _walk(value: Any, shape: Any, path: Path, found: _Findings) -> None:
+    if shape is ANY or value is None:
+        return
+    if isinstance(value, _yaml.Tagged):
+        value = value.value
+    kind = type(shape)
+    if kind is Record:
+        if not isinstance(value, dict):
+            if shape.loose:
+                return
+            found.add_doubt(path, f"{_shown(value)} is no mapping")
+            return
+        if not (shape.open or shape.each is not ANY) and not value.keys() <= shape.known:
+            found.add_unknown(path, frozenset(value.keys() - shape.known))
+        for key, rule in shape.rules:
+            if (inner := value.get(key)) is not None:
+                _walk(inner, rule, (key, path), found)
+        if shape.each is not ANY:
+            for key in value.keys() - shape.known:
+                _walk(value[key], shape.each, (key, path), found)
+    elif kind is list:
+        if not isinstance(value, list):
+            found.add_doubt(path, f"{_shown(value)} is no list")
+            return
+        for k, item in enumerate(value):
+            _walk(item, shape[0], (k, path), found)
+    elif kind is tuple:  # a row: a shape for each place
+        for k, (item, rule) in enumerate(zip(value, shape, strict=False) if isinstance(value, list) else ()):
+            _walk(item, rule, (k, path), found)
+    elif kind is Typed:
+        _walk(value[1] if isinstance(value, list) and len(value) == 2 else value, shape.shape, path, found)
+    else:
+        refusal, doubt = shape.check(value)
+        if refusal:
+            where = _where(path)
+            raise UnreadableFile(f"{where}: {refusal}", [Problem(refusal, found.file, where=where)])
+        if doubt:
+            found.add_doubt(path, doubt)
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, str):
+        try:
+            value = _yaml.scalar(str.__str__(value).strip() or "~")
+        except ValueError:
+            return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def _shown(value: Any) -> str:
+    text = (
+        repr(value) if not isinstance(value, (dict, list)) else f"a {'mapping' if isinstance(value, dict) else 'list'}"
+    )
+    return text if len(text) <= 60 else f"{text[:59]}…"
+
+
+def _steps(path: Path) -> Iterator[Any]:
+    while path:
+        key, path = path
+        yield key
+
+
+def _where(path: Path) -> str:
+    steps = [f"[{s}]" if isinstance(s, int) else f".{s[:80]}" for s in reversed(list(_steps(path)))]
+    return "".join(steps).removeprefix(".") or "top"
+
+
+def _pattern(path: Path) -> str:
+    steps = ["[]" if isinstance(s, int) else f".{s[:80]}" for s in reversed(list(_steps(path)))]
+    return "".join(steps).removeprefix(".") or "top"
