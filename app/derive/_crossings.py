@@ -10,10 +10,9 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive._obstacles import body_of
-from app.errors import FleetMapError, Problem
+from app.errors import FleetMapError, Invalid, MissingDatum, Problem
 from app.model import masks
 from app.model.features import Features, Properties
-from app.model.geodesy import LocalFrame
 from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
 from app.model.solids import Solids
@@ -46,16 +45,18 @@ def crossings(networks: Layers, around: Layers, *, straight: bool) -> list[Probl
         around: the grids and objects that are in memory.
         straight: robots drive straight from node to node, whatever an edge's shape.
 
-    Networks on earth are not checked while there is no datum.
+    Networks on earth are not checked while there is no datum, or one that is far away.
     """
     out: list[Problem] = []
     for key, part in networks.vector("topology").items():
-        if networks.frame is None and not part.local.all():
-            continue
         edges = [k for k, p in enumerate(part.properties) if p.get("kind") == "edge"][:MAX_EDGES]
+        try:
+            geometry = part.in_local(networks.frame)
+        except (MissingDatum, Invalid):
+            continue
         if not edges:
             continue
-        segments, owner = _segments(part, edges, networks.frame, straight=straight)
+        segments, owner = _segments(part, geometry, edges, straight=straight)
         grids = {k: g for k, g in around.grids().items() if k.level == key.level}
         if (grid_key := _obstacle_grid(grids)) is not None:
             hit, what = _in_grid(segments, grids[grid_key]), f"occupied cells of the occupancy grid {grid_key.name!r}"
@@ -71,10 +72,9 @@ def crossings(networks: Layers, around: Layers, *, straight: bool) -> list[Probl
 
 
 def _segments(
-    part: Features, edges: Sequence[int], frame: LocalFrame | None, *, straight: bool
+    part: Features, geometry: NDArray[np.object_], edges: Sequence[int], *, straight: bool
 ) -> tuple[Array, NDArray[np.int64]]:
     """The straight pieces of edges as float64 [n, 2, 2] in metres, and the place of each piece's edge in ``edges``."""
-    geometry = part.in_local(frame)
     shapes = geometry[list(edges)]
     if straight:
         shapes = shapes.copy()
@@ -126,10 +126,12 @@ def _in_bodies(segments: Array, around: Layers, level: str) -> NDArray[np.bool_]
     solids = Solids({})
     for key, part in around.vector("objects").items():
         rows = [k for k, p in enumerate(part.properties) if _is_body(p)] if key.level == level else []
-        if not rows or (around.frame is None and not part.local.all()):
-            continue
         chosen = part.take(rows[: MAX_BODIES - len(bodies)])
-        for p, geometry in zip(chosen.properties, chosen.in_local(around.frame), strict=True):
+        try:
+            shapes = chosen.in_local(around.frame)
+        except (MissingDatum, Invalid):
+            continue
+        for p, geometry in zip(chosen.properties, shapes, strict=True):
             try:
                 body = body_of({**p, "shapes": None}, geometry, solids)
             except FleetMapError:  # what it is made of cannot be used: its derivations report it

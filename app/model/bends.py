@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from app.model.features import MAX_ID, Features, Properties, unique_ids
 from app.model.geodesy import LocalFrame
 from app.model.layers import Layers, Part, PartKey
+from app.model.network import middle_frame
 
 TOLERANCE_METRES = 0.05
 """Maximum distance of a straight edge from the bent one, in metres: vertices that matter less are no bends."""
@@ -54,7 +55,7 @@ def split(layers: Layers, shape_of: str | None = None) -> tuple[Layers, Split]:
     Args:
         shape_of: a format with shapes that its consumers ignore: edges that it identifies keep theirs.
 
-    Networks on earth stay as they are while there is no datum: their writers report it.
+    Networks of both anchors stay as they are while there is no datum: their writers report it.
     """
     parts: dict[PartKey, Part] = {}
     total = Split()
@@ -64,8 +65,10 @@ def split(layers: Layers, shape_of: str | None = None) -> tuple[Layers, Split]:
         nodes[key.level].update(i for i, p in zip(part.ids, part.properties, strict=True) if p.get("kind") == "node")
     for key, part in networks.items():
         places = _bent(part, nodes[key.level], shape_of)
-        if len(places) and (layers.frame is not None or part.local.all()):
-            parts[key], count = _split_part(part, places, layers.frame)
+        if len(places) and (part.local.all() or not part.local.any() or layers.frame is not None):
+            # Distances are all that counts, so places on earth need no datum, and none that is near.
+            frame = layers.frame if part.local.any() else middle_frame(shapely.get_coordinates(part.geometry))
+            parts[key], count = _split_part(part, places, frame)
             total = Split(total.edges + count.edges, total.nodes + count.nodes)
     return (replace(layers, parts={**layers.parts, **parts}), total) if total.nodes else (layers, total)
 

@@ -143,7 +143,7 @@ def clear_of_obstacles(layers: Layers, known: formats.Format, files: dict[str, b
             grid = grids.get(key.level) or next(iter(grids.values()))
             at = dict(zip(part.ids, part.in_local(layers.frame), strict=True))
             for i, p in zip(part.ids, part.properties, strict=True):
-                if p["kind"] != "edge" or (len(grids) > 1 and key.level not in grids):
+                if p["kind"] != "edge" or len(read.vector("topology")) < len(grids):  # levels are joined
                     continue
                 line = at[i] if shaped else shapely.LineString([at[p["source"]], at[p["target"]]])
                 steps = np.arange(0.0, line.length, grid.resolution / 2)

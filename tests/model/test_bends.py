@@ -122,6 +122,7 @@ def test_places_on_earth_bend_by_metres() -> None:
     index = straight.index()
     there = shapely.get_coordinates(straight.take([index["a~b~2"]]).in_local(frame))
     assert there == pytest.approx(np.array([[2.0, 6.0]]), abs=1e-6)
+    assert edges(bends.split(Layers({KEY: earth}))[0]) == edges(Layers({KEY: straight})), "without a datum, too"
 
 
 def test_edited_pieces_stay_pieces() -> None:
