@@ -11,6 +11,7 @@ import typer
 from app.cli import folder as folders
 from app.cli import local, options, output, write
 from app.cli.client import Client, Download, LocalFile, Refused, path_of
+from app.cli.companions import with_companions
 from app.cli.history import change_line, channel_rows
 from app.errors import Invalid, NotFound
 from app.model.frame import GROUND, Datum
@@ -176,6 +177,7 @@ def convert(
     ours |= {name for step in all_derivations() for name in takes(step)}
     values = options.pairs(option)
     files, _, notes = _collect(paths)
+    files = with_companions(files)
     hints = Hints(format, _layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})
     wanted = {k: v for k, v in values.items() if k in ours}
     with output.progress_bar(f"converting to {to}"):
@@ -207,6 +209,7 @@ def check(
     from app import bundle, formats
 
     collected, _, notes = _collect(paths)
+    collected = with_companions(collected)
     files = bundle.unpack({f.name: f.path.read_bytes() for f in collected}, formats.Limits())
     groups, rest = formats.group({name: data for name, data in files.items() if data}, format)
     told: list[dict[str, Any]] = []

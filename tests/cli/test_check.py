@@ -61,3 +61,43 @@ def test_what_is_no_map_is_said(offline: Fleetmap, tmp_path: Path) -> None:
     named = offline("check", tmp_path / "note.txt", "--format", "nav2_route")
     assert named.status == 1
     assert "would be refused" in named.out
+
+
+def test_the_picture_beside_a_named_file_is_read(offline: Fleetmap, tmp_path: Path) -> None:
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    path = a_map(folder, image="/home/somebody/map.pgm")
+    (tmp_path / "map.pgm").write_bytes(b"P5 1 1 255\n\0")
+    told = offline("check", path, "--json")
+    assert [(line["file"], line["result"]) for line in told.json["maps"]] == [("map.yaml", "warning")]
+    a_map(folder)
+    told = offline("check", path, "--json")
+    assert (told.status, told.json["maps"][0]["result"], told.json["unknown"]) == (0, "fine", [])
+    out = tmp_path / "out"
+    told = offline("convert", path, "--to", "occupancy_grid", "-o", f"{out}/")
+    assert told.status == 0, told.err
+    assert (out / "map.pgm").read_bytes().endswith(bytes([0, 254, 205, 254]))
+
+
+def test_files_outside_of_a_maps_folder_are_not_read(offline: Fleetmap, tmp_path: Path) -> None:
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    (tmp_path / "other.pgm").write_bytes(b"P5 2 2 255\n" + bytes(4))
+    (folder / "linked.pgm").symlink_to(tmp_path / "other.pgm")
+    for image in ("../other.pgm", str(tmp_path / "other.pgm"), "linked.pgm"):
+        told = offline("convert", a_map(folder, image=image), "--to", "occupancy_grid", "-o", "-")
+        assert told.status == 1, image
+        assert "is not in the upload" in told.err
+
+
+def test_companions_of_all_formats(offline: Fleetmap, shared: Path, tmp_path: Path) -> None:
+    """What is named alone gives the map that its folder gives."""
+    data = shared / "data"
+    named = {
+        "openrmf_building/robast_sim/robast_sim.building.yaml": "openrmf",
+        "gazebo_sdf/environment_common_test_files/test.world": "gazebo",
+        "lanelet2/autoware_mgrs_mini/lanelet2_map.osm": "lanelet2",
+    }
+    for name, form in named.items():
+        told = offline("check", data / name, "--json")
+        assert [line["format"] for line in told.json["maps"]] == [form], told.out
