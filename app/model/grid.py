@@ -106,7 +106,7 @@ def packed_cells(chosen: NDArray[np.bool_]) -> dict[str, Any]:
 def unknown_grey(grid: OccupancyGrid) -> NDArray[np.bool_] | None:
     """The free cells of a grid that have the grey of unknown ones; None where there are none."""
     known = grid.properties.get(UNKNOWN_GREY)
-    if not isinstance(known, Mapping) or (known.get("height"), known.get("width")) != grid.cells.shape:
+    if not isinstance(known, Mapping) or [known.get("height"), known.get("width")] != [grid.height, grid.width]:
         return None
     size = (grid.cells.size + 7) // 8
     try:
@@ -115,8 +115,8 @@ def unknown_grey(grid: OccupancyGrid) -> NDArray[np.bool_] | None:
         return None
     if len(bits) != size:
         return None
-    chosen = np.unpackbits(np.frombuffer(bits, np.uint8), count=grid.cells.size).reshape(grid.cells.shape)
-    out = chosen.astype(bool) & (grid.cells == FREE)
+    chosen = np.unpackbits(np.frombuffer(bits, np.uint8), count=grid.cells.size)
+    out = chosen.astype(bool).reshape(grid.height, grid.width) & (grid.cells == FREE)
     return out if out.any() else None
 
 
@@ -125,9 +125,10 @@ def without_unknown_grey(grid: OccupancyGrid, seen: NDArray[np.bool_] | None = N
     if UNKNOWN_GREY not in grid.properties:
         return grid
     rest = {word: value for word, value in grid.properties.items() if word != UNKNOWN_GREY}
-    grey = unknown_grey(grid) if seen is not None else None
-    if grey is not None and (grey & ~seen).any():
-        rest[UNKNOWN_GREY] = packed_cells(grey & ~seen)
+    grey = None if seen is None else unknown_grey(grid)
+    left = None if grey is None or seen is None else grey & ~seen
+    if left is not None and left.any():
+        rest[UNKNOWN_GREY] = packed_cells(left)
     return replace(grid, properties=rest)
 
 
