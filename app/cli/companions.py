@@ -18,26 +18,36 @@ MAX_LISTED = 20_000
 
 def with_companions(files: Sequence[LocalFile]) -> list[LocalFile]:
     """Add the companions of files that are named by themselves; a name that is taken stays."""
-    from app import formats
-
     out = {file.name: file for file in files}
     for file in files:
         if "/" in file.name or file.path.name != file.name:  # of a folder, which is taken with all its files
             continue
         beside = _Beside(file.path)
-        data = beside[file.name]
-        known = formats.detect(file.name, data)
-        if known is None:
-            continue
-        names = list(beside)
-        if known.sort is not None:
-            wanted = known.sort(beside, [file.name]).get(file.name, ())
-        else:
-            wanted = [*known.companions(file.name, data, names), *known.looks_at(file.name, names)]
-        for name in wanted:
-            if name in beside:
-                out.setdefault(name, single(beside.path(name), name))
+        # A picture says nothing of itself: what speaks for it is a file of its name (a world file, a YAML).
+        same = [n for n in beside if "/" not in n and n != file.name and _stem(n) == _stem(file.name)]
+        speaking = [n for n in same if file.name in _companions(n, beside)]
+        for name in [*_companions(file.name, beside), *speaking]:
+            out.setdefault(name, single(beside.path(name), name))
     return list(out.values())
+
+
+def _stem(name: str) -> str:
+    return name.rpartition(".")[0].lower()
+
+
+def _companions(main: str, beside: _Beside) -> list[str]:
+    """The files that a map names, of those beside and below it; none if it is no map."""
+    from app import formats
+
+    known = formats.detect(main, beside[main])
+    if known is None:
+        return []
+    if known.sort is not None:
+        wanted = known.sort(beside, [main]).get(main, ())
+    else:
+        names = list(beside)
+        wanted = [*known.companions(main, beside[main], names), *known.looks_at(main, names)]
+    return [name for name in wanted if name in beside and name != main]
 
 
 class _Beside(Mapping[str, bytes]):

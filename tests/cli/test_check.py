@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
+from app.cli.companions import with_companions
+from app.cli.folder import single
 from tests.cli.conftest import Fleetmap
 
 YAML = "image: {image}\nresolution: 0.05\norigin: [0, 0, {yaw}]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
@@ -90,14 +95,31 @@ def test_files_outside_of_a_maps_folder_are_not_read(offline: Fleetmap, tmp_path
         assert "is not in the upload" in told.err
 
 
-def test_companions_of_all_formats(offline: Fleetmap, shared: Path, tmp_path: Path) -> None:
-    """What is named alone gives the map that its folder gives."""
-    data = shared / "data"
-    named = {
-        "openrmf_building/robast_sim/robast_sim.building.yaml": "openrmf",
-        "gazebo_sdf/environment_common_test_files/test.world": "gazebo",
-        "lanelet2/autoware_mgrs_mini/lanelet2_map.osm": "lanelet2",
+WORLD = """<sdf version="1.9"><world name="w"><include><uri>model://crate</uri></include></world></sdf>"""
+MODEL = """<sdf version="1.9"><model name="crate"><static>true</static><link name="l"><collision name="c">
+<geometry><box><size>1 1 1</size></box></geometry></collision></link></model></sdf>"""
+CONFIG = """<model><name>crate</name><sdf version="1.9">model.sdf</sdf></model>"""
+
+
+def test_companions_are_those_that_each_format_names(shared: Path, tmp_path: Path) -> None:
+    """A building's floor plans, a world's models below it, a picture's world file; nothing else of the folder."""
+    crate = tmp_path / "models" / "crate"
+    crate.mkdir(parents=True)
+    (tmp_path / "w.world").write_text(WORLD)
+    (crate / "model.sdf").write_text(MODEL)
+    (crate / "model.config").write_text(CONFIG)
+    Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "field.png")
+    (tmp_path / "field.pgw").write_text("1\n0\n0\n-1\n0\n0\n")
+    (tmp_path / "other.pgw").write_text("1\n0\n0\n-1\n0\n0\n")
+    hotel = shared / "data" / "openrmf_building" / "hotel" / "hotel.building.yaml"
+    expected = {
+        tmp_path / "w.world": {"models/crate/model.sdf", "models/crate/model.config"},
+        tmp_path / "field.png": {"field.pgw"},
+        tmp_path / "field.pgw": {"field.png"},
+        hotel: {f"hotel_L{n}.png" for n in (1, 2, 3)},
     }
-    for name, form in named.items():
-        told = offline("check", data / name, "--json")
-        assert [line["format"] for line in told.json["maps"]] == [form], told.out
+    for path, names in expected.items():
+        found = with_companions([single(path)])
+        assert {f.name for f in found} == {path.name} | names
+    named = with_companions([single(tmp_path / "field.png"), single(tmp_path / "other.pgw", "field.pgw")])
+    assert [f.path.name for f in named] == ["field.png", "other.pgw"], "what the user names stays"
