@@ -123,3 +123,10 @@ def test_companions_are_those_that_each_format_names(shared: Path, tmp_path: Pat
         assert {f.name for f in found} == {path.name} | names
     named = with_companions([single(tmp_path / "field.png"), single(tmp_path / "other.pgw", "field.pgw")])
     assert [f.path.name for f in named] == ["field.png", "other.pgw"], "what the user names stays"
+
+
+def test_a_wrong_option_of_a_generator_lists_its_own(offline: Fleetmap, tmp_path: Path) -> None:
+    told = offline("generate", "orchard", "--to", "tmap2", "-o", tmp_path / "n.yaml", "-O", "typo=1")
+    assert told.status == 1
+    assert "typo: no such parameter of orchard; accepted: crown_diameter," in told.err
+    assert "tmap2 accepts action," in told.err

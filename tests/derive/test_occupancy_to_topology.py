@@ -367,6 +367,8 @@ def test_grids_without_ways_say_what_to_do(method: str) -> None:
     spot[4, 4] = FREE
     assert "too few for a way" in bad(spot, method=method, robot_radius=0.0)
     assert "'map' of level 'ground'" in bad(spot, method=method, robot_radius=0.0)
+    if method != "roadmap":
+        assert "give a spacing above 0" in bad(spot, method=method, robot_radius=0.0, spacing=0.0)
 
 
 def test_thresholds_in_between_are_not_free() -> None:
