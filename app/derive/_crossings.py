@@ -49,19 +49,21 @@ def crossings(networks: Layers, around: Layers, *, straight: bool) -> list[Probl
     """
     out: list[Problem] = []
     for key, part in networks.vector("topology").items():
+        grids = {k: g for k, g in around.grids().items() if k.level == key.level}
+        grid_key = _obstacle_grid(grids)
+        bodies = _bodies(around, key.level) if grid_key is None else []
         edges = [k for k, p in enumerate(part.properties) if p.get("kind") == "edge"][:MAX_EDGES]
+        if not edges or (grid_key is None and not bodies):
+            continue
         try:
             geometry = part.in_local(networks.frame)
         except (MissingDatum, Invalid):
             continue
-        if not edges:
-            continue
         segments, owner = _segments(part, geometry, edges, straight=straight)
-        grids = {k: g for k, g in around.grids().items() if k.level == key.level}
-        if (grid_key := _obstacle_grid(grids)) is not None:
+        if grid_key is not None:
             hit, what = _in_grid(segments, grids[grid_key]), f"occupied cells of the occupancy grid {grid_key.name!r}"
         else:
-            hit, what = _in_bodies(segments, around, key.level), "buildings or walls"
+            hit, what = _in_bodies(segments, bodies), "buildings or walls"
         ids = [part.ids[edges[n]] for n in np.unique(owner[hit]).tolist()]
         if ids:
             count = "1 edge crosses" if len(ids) == 1 else f"{len(ids)} edges cross"
@@ -80,8 +82,8 @@ def _segments(
         shapes = shapes.copy()
         point = shapely.get_type_id(geometry) == 0
         nodes = {i: g for i, g, is_point in zip(part.ids, geometry, point, strict=True) if is_point and not g.is_empty}
-        for n, k in enumerate(edges):
-            p = part.properties[k]
+        for n in np.flatnonzero(shapely.get_num_coordinates(shapes) > 2).tolist():
+            p = part.properties[edges[n]]
             ends = [nodes.get(str(p.get(word))) for word in ("source", "target")]
             if ends[0] is not None and ends[1] is not None:
                 shapes[n] = shapely.LineString([(end.x, end.y) for end in ends if end is not None])
@@ -101,7 +103,6 @@ def _in_grid(segments: Array, grid: OccupancyGrid) -> NDArray[np.bool_]:
     x, y, yaw = grid.origin
     cosine, sine = np.cos(yaw), np.sin(yaw)
     turned = (segments - np.array([x, y])) @ np.array([[cosine, -sine], [sine, cosine]])
-    occupied = (grid.cells >= grid.occupied_thresh * OCCUPIED) & (grid.cells != UNKNOWN)
     hit = np.zeros(len(segments), bool)
     length = np.hypot(*(turned[:, 1] - turned[:, 0]).T)
     step = max(grid.resolution / 2, float(length.sum()) / MAX_SAMPLES)
@@ -115,13 +116,15 @@ def _in_grid(segments: Array, grid: OccupancyGrid) -> NDArray[np.bool_]:
         at = turned[number, 0] + (turned[number, 1] - turned[number, 0]) * share[:, None]
         column, row = np.floor(at / grid.resolution).astype(np.int64).T
         inside = (row >= 0) & (row < grid.height) & (column >= 0) & (column < grid.width)
-        hit[number[inside][occupied[row[inside], column[inside]]]] = True
+        cells = grid.cells[row[inside], column[inside]]  # not of the whole grid, which may have 300 million
+        occupied = (cells >= grid.occupied_thresh * OCCUPIED) & (cells != UNKNOWN)
+        hit[number[inside][occupied]] = True
         begin = end
     return hit
 
 
-def _in_bodies(segments: Array, around: Layers, level: str) -> NDArray[np.bool_]:
-    """Which pieces lead through the ground plan of a building or a wall, from outside to outside."""
+def _bodies(around: Layers, level: str) -> list[Any]:
+    """The ground plans of a level's buildings and walls, in metres."""
     bodies: list[Any] = []
     solids = Solids({})
     for key, part in around.vector("objects").items():
@@ -138,9 +141,12 @@ def _in_bodies(segments: Array, around: Layers, level: str) -> NDArray[np.bool_]
                 continue
             if body is not None and not body.is_empty:
                 bodies.append(body)
+    return bodies
+
+
+def _in_bodies(segments: Array, bodies: Sequence[Any]) -> NDArray[np.bool_]:
+    """Which pieces lead through a ground plan, from outside to outside."""
     hit = np.zeros(len(segments), bool)
-    if not bodies:
-        return hit
     grounds, pieces = np.array(bodies, object), shapely.linestrings(segments)
     piece, ground = shapely.STRtree(grounds).query(pieces, predicate="crosses")
     ends = shapely.points(segments.reshape(-1, 2)).reshape(-1, 2)[piece]

@@ -60,6 +60,8 @@ def split(layers: Layers, shape_of: str | None = None) -> tuple[Layers, Split]:
     parts: dict[PartKey, Part] = {}
     total = Split()
     networks = layers.vector("topology")
+    if not any((shapely.get_num_coordinates(part.geometry) > 2).any() for part in networks.values()):
+        return layers, total
     nodes: dict[str, set[str]] = defaultdict(set)
     for key, part in networks.items():
         nodes[key.level].update(i for i, p in zip(part.ids, part.properties, strict=True) if p.get("kind") == "node")
