@@ -98,6 +98,27 @@ def _template(folder: Path) -> tuple[Path, Path | None]:
     return folder, None
 
 
+def walk(folder: Path, limit: int) -> Iterator[Path]:
+    """Regular files beside each other and below, the nearest first, at most ``limit``. Links that lead out and folders
+    that cannot be listed are passed over."""
+    waiting, count = [folder], 0
+    while waiting and count < limit:
+        here = waiting.pop(0)
+        try:
+            entries = sorted(entry for entry in here.iterdir() if entry.name not in SKIPPED)
+        except OSError:
+            continue
+        for entry in entries:
+            linked = entry.is_symlink()
+            if linked and not entry.resolve().is_relative_to(folder):
+                continue
+            if entry.is_file() and count < limit:
+                count += 1
+                yield entry
+            elif entry.is_dir() and not linked and not entry.name.startswith(".") and len(waiting) < limit:
+                waiting.append(entry)
+
+
 def _is_config(folder: Path) -> bool:
     return folder.is_dir() and any((folder / part).is_dir() for part in PARTS)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +14,7 @@ from app.cli.created import ensured
 from app.cli.folder import check_name, environment_name
 from app.cli.history import show_made
 from app.cli.maps import show_report
-from app.errors import Invalid
+from app.errors import Invalid, Problem
 
 if TYPE_CHECKING:
     from app.model.frame import Datum
@@ -115,6 +116,18 @@ def _list(*, as_json: bool) -> None:
     )
 
 
+def _check_names(site: str, ours: set[str], to: str, values: Mapping[str, str]) -> None:
+    """Check options before anything is made. Raises Invalid with those of the generator and of the format."""
+    from app import derive, formats, parameters
+
+    theirs = {p["name"] for p in parameters.describe(formats.get_format(to).write_options)}
+    derived = {name for step in derive.all_derivations() for name in derive.takes(step)}
+    for name in values.keys() - ours - theirs - derived:
+        of_format = f"; {to} accepts {', '.join(sorted(theirs))}" if theirs else ""
+        reason = f"no such parameter of {site}; accepted: {', '.join(sorted(ours))}{of_format}"
+        raise Invalid(f"{name}: {reason}", [Problem(reason, where=name)])
+
+
 def _write(
     site: str, seed: int, values: dict[str, str], datum: Datum | None, to: str, out: str, *, as_json: bool
 ) -> None:
@@ -132,6 +145,7 @@ def _write(
             f"{site} works on {', '.join(sorted(known.works_on))} of an environment: name one with --environment"
         )
     ours = {p["name"] for p in parameters.describe(known.parameters)}
+    _check_names(site, ours, to, values)
     own = {n: v for n, v in values.items() if n in ours}
     notes = Notes()
     with output.progress_bar(f"generating {site}"):

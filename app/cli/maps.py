@@ -11,6 +11,7 @@ import typer
 from app.cli import completion, local, options, output, write
 from app.cli import folder as folders
 from app.cli.client import Client, Download, LocalFile, path_of
+from app.cli.companions import with_companions
 from app.cli.created import ensured
 from app.cli.history import change_line, channel_rows
 from app.errors import Invalid, NotFound
@@ -197,6 +198,7 @@ def convert(
     ours |= {name for step in all_derivations() for name in takes(step)}
     values = options.pairs(option)
     files, _, notes = _collect(paths)
+    files = with_companions(files)
     hints = Hints(format, drawn_layer(layer), level, grid, {k: v for k, v in values.items() if k not in ours})
     wanted = {k: v for k, v in values.items() if k in ours}
     with output.progress_bar(f"converting to {to}"):
@@ -230,6 +232,7 @@ def check(
     from app import bundle, formats
 
     collected, _, notes = _collect(paths)
+    collected = with_companions(collected)
     files = bundle.unpack({f.name: f.path.read_bytes() for f in collected}, formats.Limits())
     groups, rest = formats.group({name: data for name, data in files.items() if data}, format)
     told: list[dict[str, Any]] = []

@@ -16,6 +16,7 @@ from app.convert import recipe as recipes
 from app.convert import site
 from app.convert.recipe import Chain, Hindrance, Spread
 from app.derive import Step
+from app.derive._crossings import crossings
 from app.errors import CannotConvert, CannotDerive, FleetMapError, MissingLayer, Problem
 from app.formats import Format, Inner, WriteContext, _archive
 from app.model.closures import Closures
@@ -74,6 +75,18 @@ def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) ->
     return None
 
 
+def stored_crossings(
+    database_url: str, blob_dir: str, version: Version, name: str, keys: Sequence[PartKey]
+) -> list[Problem]:
+    """In a worker: warn of stored edges that lead through the version's obstacles. keys: the parts of the map."""
+    known = formats.get_format(name)
+    seen = [e.key for e in version.parts if e.key.layer in ("occupancy", "objects") and e.key not in keys]
+    layers = applied_closures.load(open_store(database_url, blob_dir), version, [*keys, *seen])
+    chosen = known.choose(sorted(k for k in keys if k.layer in known.carries), formats.write_options(known, {}))
+    used = replace(layers, parts={k: layers.parts[k] for k in chosen})
+    return crossing_edges(known, applied_closures.close(known, used, version.closures)[0], layers)
+
+
 def lacking(database_url: str, blob_dir: str, version: Version, name: str, way: Chain) -> Hindrance | None:
     """In a worker: what a format wants of its layers besides that they are there, and they do not have, or None."""
     known = formats.get_format(name)
@@ -97,16 +110,17 @@ def write(
     templates: Templates = NO_TEMPLATES,
     closures: Closures | None = None,
     spread: Spread | None = None,
+    around: Layers | None = None,
 ) -> Written:
     """Derive and write. ``entries`` (of a stored version) or ``origin`` and ``credit`` (of files) say where each part
     came from, and under which licences and credits. templates: for the maps that a format holds. closures: to apply.
-    spread: write every part that is derived.
+    spread: write every part that is derived. around: further layers, in which edges may meet obstacles.
     """
     notes = derive.Notes()
     options = recipes.own_options(known, values)
     if entries is None:  # of files; what is stored was loaded without them
         layers = applied_closures.without_timed_marks(layers)
-    source = _Source(layers, way, entries, origin, credit, templates, closures)
+    source = _Source(layers, way, entries, origin, credit, templates, closures, around or Layers())
     if spread is None:
         return _written(known, derive.run(way.steps, layers, notes), options, source, notes)
     try:
@@ -131,6 +145,7 @@ class _Source:
     credit: Mapping[PartKey, Sequence[str]] | None
     templates: Templates
     closures: Closures | None
+    around: Layers
 
 
 def _written_each(
@@ -188,6 +203,8 @@ def _written(known: Format, made: Layers, options: Any, source: _Source, notes: 
     context.attribution = tuple(sorted(credits_of(lines)))  # whichever part came first: equal content, equal bytes
     files = formats.write(known, used, context)
     _report_blocked(known, closed, context)
+    if not known.holds:  # as above
+        context.warnings += crossing_edges(known, used, replace(made, parts={**source.around.parts, **made.parts}))
     known_lines = {(line["layer"], line["level"], line["name"]) for line in lines}
     lines += [line for line in inner if (line["layer"], line["level"], line["name"]) not in known_lines]
     report = {
@@ -201,6 +218,12 @@ def _written(known: Format, made: Layers, options: Any, source: _Source, notes: 
         "closures": applied_closures.merged_lines([closed.lines, *inner_closures]),
     }
     return Written(files, report)
+
+
+def crossing_edges(known: Format, written: Layers, around: Layers) -> list[Problem]:
+    """Warn of edges that lead through obstacles in a map of these layers. around: layers with grids and objects."""
+    straight, _ = formats.straightened(known, written)
+    return crossings(straight, around, straight=known.bends != "shape")
 
 
 def _lacks_edges(known: Format, layers: Layers) -> bool:
@@ -242,7 +265,7 @@ def from_layers(
             raise recipes.exhausted(error, failed) from error
         kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
         try:
-            return write(known, kept, asked, way, entries, origin, credit, closures=closures)
+            return write(known, kept, asked, way, entries, origin, credit, closures=closures, around=layers)
         except CannotDerive as error:
             without |= {error.step}
             failed.append(Hindrance(error.step, error.detail, error.choose))

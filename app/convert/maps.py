@@ -63,6 +63,7 @@ class Maps:
         self._store, self._run, self._limits = store, run, limits
         self.cache = Cache(cache_dir, cache_bytes)
         self._tried: dict[Any, Hindrance | None] = {}
+        self._crossed: dict[Any, list[Problem]] = {}
         self._failures: OrderedDict[str, tuple[float, FleetMapError]] = OrderedDict()
         self._guard = threading.Lock()
 
@@ -251,10 +252,34 @@ class Maps:
         ]
         ignored = [{"problem": reason} for reason in self._ignored(recipe)]
         warnings = [*told["warnings"], *stale, *ignored]
+        texts = {line["problem"] for line in warnings}
+        warnings += [p.as_dict() for p in self._crossings(recipe) if p.problem not in texts]
         filled = making.labelled(told["template"], recipe.origin, recipe.version.templates)
         more = {"layers": lines, "attribution": credit, "template": filled, "dropped": dropped, "warnings": warnings}
         closures = applied_closures.report_lines(recipe.version, told["closures"])
         return {**told, "version": version, "closures": closures, **more}
+
+    def _crossings(self, recipe: Recipe) -> list[Problem]:
+        """Warnings of edges that lead through obstacles which the map itself does not hold."""
+        version, known, keys = recipe.version, recipe.format, recipe.chain.keys
+        network = [k for k in keys if k.layer == "topology"]
+        if recipe.steps or known.holds or not network or "topology" not in known.carries:
+            return []
+        beside = [(e.key, e.hash) for e in version.parts if e.key.layer in ("occupancy", "objects")]
+        key = ("crossings", recipe.key, version.datum, tuple(beside))
+        with self._guard:
+            found = self._crossed.get(key)
+        if found is None:
+            where = (self._store.database_url, str(self._store.blob_dir))
+            try:
+                found = self._run(making.stored_crossings, *where, version, known.name, network)
+            except (FleetMapError, WorkerDied) as error:
+                found = [Problem(f"edges were not checked against obstacles: {error.detail}")]
+            with self._guard:
+                self._crossed[key] = found
+                while len(self._crossed) > TRIED:
+                    self._crossed.pop(next(iter(self._crossed)))
+        return found
 
     def _ignored(self, recipe: Recipe) -> list[str]:
         """What the environment's templates say and this release cannot use."""

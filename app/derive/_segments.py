@@ -164,6 +164,11 @@ def segments(ground: Ground, how: Segmentation, method: str, nir: int | None, no
     """
     import cv2
 
+    if ground.grey and nir is None and ground.raw.shape[2] >= 3:
+        raise CannotConvert(
+            f"{name} does not say which of its bands are red, green and blue: tag them (gdal_translate -colorinterp "
+            "red,green,blue), or give the number of the near-infrared band as near_infrared"
+        )
     if ground.grey and nir is None:
         raise CannotConvert(
             f"{name} has no colours: what grows and what does not cannot be told. A floor plan is asked for with "

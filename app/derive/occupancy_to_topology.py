@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -22,7 +22,7 @@ from app.derive import Notes, derives
 from app.derive._grids import called, chosen
 from app.errors import CannotConvert, Invalid, Problem, TooLarge
 from app.model.features import Compact, Features, Properties, from_columns, points
-from app.model.grid import OccupancyGrid
+from app.model.grid import UNKNOWN, OccupancyGrid, unknown_grey
 from app.model.layers import NETWORK, Layers, Part, PartKey
 from app.parameters import parameter
 
@@ -58,6 +58,10 @@ class Parameters:
         0.3, "radius of the robot: no edge is nearer to an obstacle", minimum=0.0, maximum=100.0, unit="m"
     )
     unknown: bool = parameter(False, "whether unknown cells may be driven through")
+    unknown_grey: Literal["unknown", "free"] = parameter(
+        "unknown",
+        "what free cells of the grey 205 are: map_saver writes it for unknown, and a free_thresh of 0.25 calls it free",
+    )
     tolerance: float = parameter(
         0.1, "how far straight edges may be from the skeleton or diagram", minimum=0.0, maximum=100.0, unit="m"
     )
@@ -113,6 +117,7 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: s
     """One grid's network. called: what errors call the grid."""
     from app.derive import _roadmap, _skeleton
 
+    grid = _without_unseen(grid, parameters, notes, called)
     where = _space(grid, parameters, called)
     cell = grid.resolution
     graph, islands = _skeleton.skeleton(
@@ -145,13 +150,33 @@ def network(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: s
             graph, where, spacing=spacing, detour=parameters.detour, phase=_phase(grid, where, spacing)
         )
     if not len(graph.edges):
+        supply = "a smaller robot_radius, more samples" if parameters.method == "roadmap" else "a smaller robot_radius"
+        if parameters.method != "roadmap" and not parameters.spacing:
+            supply = "a spacing above 0 (spacing=0 puts nodes at corners and crossings only), " + supply
         raise CannotConvert(
             f"{called} leaves {where.cells} cells to a robot of radius {parameters.robot_radius:g} m, too few for a "
-            f"way between two places: give a smaller robot_radius, more samples, or a grid of more than one spot"
+            f"way between two places: give {supply}, or a grid of more than one spot"
         )
     row, column, width = where.row, where.column, _widths(where, graph)
     del where  # three bytes a cell, which the features may need
     return _features(grid, row, column, graph, width)
+
+
+def _without_unseen(grid: OccupancyGrid, parameters: Parameters, notes: Notes, called: str) -> OccupancyGrid:
+    """The grid with its free cells of unknown's grey as unknown, unless they are to be free."""
+    grey = unknown_grey(grid)
+    if grey is None:
+        return grid
+    count = f"{called} has {int(np.count_nonzero(grey))} cells of the grey 205, map_saver's unknown, which its "
+    fix = "write free_thresh: 0.196 where such cells mean unknown"
+    if parameters.unknown_grey == "free":
+        notes.warn(f"{count}free_thresh of {grid.free_thresh:g} calls free: ways may lead where nobody has been; {fix}")
+        return grid
+    notes.warn(
+        f"{count}free_thresh of {grid.free_thresh:g} calls free: no ways lead there; unknown_grey=free takes them as "
+        f"free; {fix}"
+    )
+    return replace(grid, cells=np.where(grey, np.uint8(UNKNOWN), grid.cells))
 
 
 def _check(parameters: Parameters) -> None:

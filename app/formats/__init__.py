@@ -18,13 +18,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from lxml import etree
 
 from app import parameters
 from app.errors import BadUpload, FleetMapError, Invalid, NotFound, Problem, TooLarge, UnreadableFile
+from app.model import bends
 from app.model.features import Features
 from app.model.frame import GROUND, Anchor
 from app.model.geodesy import LocalFrame
@@ -196,6 +197,12 @@ class Parts:
     default: str = MAP
 
 
+Bends = Literal["shape", "nodes", "foreign"]
+"""What becomes of an edge's bends: the format has shapes; or its edges are straight, so that bends become nodes
+(``app.model.bends``), which become bends again when it is read; or it has shapes that its consumers ignore, so that
+bends of edges from elsewhere become nodes, and stay ones."""
+
+
 @dataclass(frozen=True, slots=True)
 class Format:
     """A file format. Only what is declared here is known of it elsewhere.
@@ -216,7 +223,7 @@ class Format:
     picture without a place); empty for other files. completing: the read options that say it.
     looks_at: files of other maps of the upload that it looks into. parts: the options that select a stored part, for
     formats whose files hold one part each. holds: it is a folder of other formats' maps. marks_blocked: it can
-    express a blocked edge, so that such an edge stays in it; other formats leave it out.
+    express a blocked edge, so that such an edge stays in it; other formats leave it out. bends: see ``Bends``.
     """
 
     name: str
@@ -250,6 +257,7 @@ class Format:
     lacking: Callable[[str, bytes], str] = lambda name, data: ""
     completing: frozenset[str] = frozenset()
     marks_blocked: bool = False
+    bends: Bends = "shape"
 
 
 @dataclass(frozen=True, slots=True)
@@ -420,6 +428,8 @@ def read(item: Group, context: ReadContext) -> Layers:
         line, reason = explain(error)
         detail = f"{item.main} cannot be read as {known.title}: {reason}"
         raise UnreadableFile(detail, [Problem(reason, item.main, line)]) from error
+    if known.bends == "nodes":
+        layers = bends.join(layers)
     count = sum(len(p) for p in layers.parts.values() if isinstance(p, Features))
     if count > context.limits.features:
         raise TooLarge(f"{item.main} has {count} features; the limit is {context.limits.features}")
@@ -464,6 +474,7 @@ def write(known: Format, layers: Layers, context: WriteContext) -> dict[str, byt
         raise Invalid(f"{known.name} can be read but not served")
     if context.options is None:
         context.options = known.write_options()
+    layers = _straightened(known, layers, context)
     with _without_collector():
         files = known.write(layers, context)
     told = SERVED.set(True)
@@ -472,6 +483,22 @@ def write(known: Format, layers: Layers, context: WriteContext) -> dict[str, byt
     finally:
         SERVED.reset(told)
     return files
+
+
+def _straightened(known: Format, layers: Layers, context: WriteContext) -> Layers:
+    """The layers with straight edges only, for formats whose consumers drive straight from node to node."""
+    straight, split = straightened(known, layers)
+    if split.nodes:
+        edges = "1 edge bends" if split.edges == 1 else f"{split.edges} edges bend"
+        context.fill("nodes at bends", split.nodes, f"{edges}, and in {known.name} edges are straight")
+    return straight
+
+
+def straightened(known: Format, layers: Layers) -> tuple[Layers, bends.Split]:
+    """The layers as a format's consumers drive them: networks with straight edges only where shapes do not count."""
+    if known.bends == "shape":
+        return layers, bends.Split()
+    return bends.split(layers, known.name if known.bends == "foreign" else None)
 
 
 LISTED = 50

@@ -161,11 +161,6 @@ class Net:
     edges: list[Edge] = field(default_factory=list)
     levels: list[str] = field(default_factory=list)
 
-    @property
-    def bends(self) -> int:
-        """How many edges are not straight."""
-        return sum(shapely.get_num_coordinates(e.geometry) > 2 for e in self.edges)
-
 
 def joined(layers: Layers, context: WriteContext) -> Net:
     """All networks, nodes and edges in the order of their parts. MissingDatum where one is on earth without a datum.

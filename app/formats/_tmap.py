@@ -749,8 +749,6 @@ class _Writer:
         self.filled["edges"] += plain
         self.dropped["items that are neither a node nor an edge from a node"] += lost
         self.dropped["nodes without a point"] += kinds.count("node") - len(said)
-        bent = (shapely.get_num_coordinates(part.geometry) > 2) & np.array([kind == "edge" for kind in kinds], bool)
-        self.dropped["edges' bends between their nodes"] += int(bent.sum())
         return edges
 
     def _positions(self, part: Features, places: Sequence[int], elevation: float) -> list[tuple[str, str, str]]:

@@ -104,7 +104,6 @@ def lines(net: Net, context: WriteContext, name: str) -> list[Line]:
         out.append(Line(edge.source, edge.target, said))
     context.drop("attributes of edges", lost, "the format has no place for them")
     context.drop("attributes of the way back", differing, "a line says the same of both directions")
-    context.drop("edges' bends between their nodes", net.bends, "lines are straight")
     if oneway:
         reason = f"{oneway} edges lead one way only, which the format cannot say: they are marked {ONEWAY}: true"
         context.warn(f"{reason}, but other readers will drive them both ways")

@@ -241,5 +241,7 @@ register(
         family=NAME,
         rank=34,
         extensions=(".ffr.yaml", ".yaml", ".yml"),
+        bends="nodes",
+        version=2,
     )
 )

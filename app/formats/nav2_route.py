@@ -590,5 +590,7 @@ register(
         lacks=lacks,
         rank=36,
         extensions=(".geojson", ".json"),
+        bends="foreign",
+        version=2,
     )
 )

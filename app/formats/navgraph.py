@@ -546,7 +546,6 @@ class _Writer:
         unnamed = sum(e.id != f"{self.net.nodes[e.source].id}_{self.net.nodes[e.target].id}" for e in edges)
         context.drop("ids of edges", unnamed, "a connection has no name; its ends say which one it is")
         context.drop("edges with attributes (action, speed limit …)", lost["edge attributes"], "connections have none")
-        context.drop("edges' bends between their nodes", self.net.bends, "connections are straight")
         context.drop("parallel edges", lost["parallel"], "Fawkes refuses a second connection of the same nodes")
         context.drop("attributes of nodes that are no scalars", lost["node attributes"], "Fawkes' properties are texts")
         context.drop("tilts of nodes", lost["tilted"], "an orientation is one angle")
@@ -617,5 +616,7 @@ register(
         family=NAME,
         rank=35,
         extensions=(".yaml", ".yml"),
+        bends="nodes",
+        version=2,
     )
 )

@@ -42,7 +42,18 @@ from app.formats import (
 )
 from app.formats._choice import file_stem, the_one
 from app.model.frame import MAX_METRES
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, Mode, OccupancyGrid, outline
+from app.model.grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    UNKNOWN_GREY,
+    Mode,
+    OccupancyGrid,
+    outline,
+    packed_cells,
+    unknown_grey,
+    without_unknown_grey,
+)
 from app.model.layers import MAP, Layers, PartKey
 from app.parameters import parameter
 
@@ -283,7 +294,10 @@ def _layers(
         if context.cells:
             shades = _image.read_grey(files[picture], context.limits)
             rule = _rule(said["mode"], said["negate"], said["occupied_thresh"], said["free_thresh"])
-            cells = _cells(shades, rule, said["mode"])
+            doubtful = _is_doubtful(rule, said["mode"], negate=said["negate"]) and not meaning
+            cells, grey = _cells(shades, rule, said["mode"], SAVED[UNKNOWN] if doubtful else None)
+            if grey is not None:
+                meaning = {**meaning, UNKNOWN_GREY: packed_cells(grey)}
         else:
             width, height = _image.size_of(files[picture], context.limits)
             cells = outline(height, width)
@@ -303,9 +317,18 @@ def _layers(
     return Layers({PartKey("occupancy", context.level, name): grid})
 
 
-def _cells(shades: _image.Grey, rule: Table, mode: Mode) -> NDArray[np.uint8]:
-    """Canonical cells (bottom row first) of a picture, a strip of rows at a time."""
+def _is_doubtful(rule: Table, mode: Mode, *, negate: bool) -> bool:
+    """Whether the grey that map_saver writes for unknown is read as free."""
+    return mode == "trinary" and not negate and bool(rule[SAVED[UNKNOWN]] == FREE)
+
+
+def _cells(
+    shades: _image.Grey, rule: Table, mode: Mode, wanted: int | None
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """Canonical cells (bottom row first) of a picture, a strip of rows at a time, and which opaque ones have the wanted
+    grey; None where there are none."""
     cells = np.empty((shades.height, shades.width), np.uint8)
+    grey = None if wanted is None else np.zeros(cells.shape, bool)
     table = rule.tobytes()
     for y, block, opaque in shades.strips():
         values = _image.look_up(block, table)
@@ -313,7 +336,9 @@ def _cells(shades: _image.Grey, rule: Table, mode: Mode) -> NDArray[np.uint8]:
             values = np.where(opaque, values, np.uint8(UNKNOWN))
         top = shades.height - y
         cells[top - len(values) : top] = values[::-1]
-    return cells
+        if grey is not None:
+            grey[top - len(values) : top] = ((block == wanted) & (values == FREE))[::-1]
+    return cells, grey if grey is not None and grey.any() else None
 
 
 def _rule(mode: Mode, negate: bool, occupied: float, free: float) -> Table:
@@ -363,11 +388,12 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     key = choose(sorted(layers.grids()), options)[0]
     grid = layers.grids()[key]
     if options.resolution is not None and options.resolution != grid.resolution:
-        grid = resampled(grid, options.resolution)
+        grid = without_unknown_grey(resampled(grid, options.resolution))
     if options.normalize:
-        grid = normalized(grid)
+        grid = without_unknown_grey(normalized(grid))
     stem = file_stem(key.name)
     grid, pixels, kind = _encoding(grid, options, context, stem + ".yaml")
+    grid, pixels = _with_grey(grid, pixels)
     if grid.origin[2] != 0.0:
         reason = f"the origin is turned by {grid.origin[2]:g} rad; Nav2 ignores that: ask for normalize=true"
         context.warn(reason, file=stem + ".yaml", where="origin")
@@ -432,6 +458,21 @@ def _encoding(
     if pixels is None:
         raise AssertionError("raw says every value")
     return grid, pixels, options.file_type or "pgm"
+
+
+def _with_grey(grid: OccupancyGrid, pixels: Table) -> tuple[OccupancyGrid, Table]:
+    """Free cells that came with the grey of unknown ones get it back, by a value that no cell has."""
+    rule = _rule(grid.mode, grid.negate, grid.occupied_thresh, grid.free_thresh)
+    grey = unknown_grey(grid) if _is_doubtful(rule, grid.mode, negate=grid.negate) else None
+    if grey is None:
+        return grid, pixels
+    present = _present(grid.cells)
+    spare = next((v for v in range(FREE + 1, OCCUPIED) if not present[v]), None)
+    if spare is None:
+        return grid, pixels
+    pixels = pixels.copy()
+    pixels[spare] = SAVED[UNKNOWN]
+    return replace(grid, cells=np.where(grey, np.uint8(spare), grid.cells)), pixels
 
 
 def _present(cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -657,7 +698,7 @@ register(
         parts=Parts("occupancy", "grid", file_stem),
         check=_occupancy_grid_rules.check,
         rank=40,
-        version=2,
+        version=3,
         extensions=(*YAML_ENDS, *IMAGE_ENDS),
     )
 )

@@ -973,12 +973,11 @@ class _Writer:
 
     def _edges(self, storey: Storey, ids: Mapping[str, int]) -> Iterator[_Lane]:
         """The level's edges, in the order of the lanes that they were."""
-        for _, p, bends in _in_order(storey.networks):
+        for _, p in _in_order(storey.networks):
             source, target = ids.get(str(p.get("source"))), ids.get(str(p.get("target")))
             if p.get("kind") != "edge" or source is None or target is None:
                 self.lost["edges without two nodes on their level"] += 1
                 continue
-            self.lost["edges' bends between their nodes"] += int(bends > 2)
             self.lost["edges' actions"] += p.get("action") is not None
             self.lost["edges' widths"] += p.get("width") is not None
             rest = own(p, NAME)
@@ -1167,17 +1166,17 @@ def _place(i: str, p: Properties) -> tuple[bool, int, str]:
     return (not known, at if isinstance(at, int) else 0, i)
 
 
-def _in_order(parts: Sequence[Features]) -> Iterable[tuple[str, Properties, int]]:
-    """(id, properties, coordinates) of what is no node: by the lane it was and its direction, then the others by id."""
+def _in_order(parts: Sequence[Features]) -> Iterable[tuple[str, Properties]]:
+    """(id, properties) of what is no node: by the lane it was and its direction, then the others by id."""
 
-    def each() -> Iterator[tuple[str, Properties, int]]:
+    def each() -> Iterator[tuple[str, Properties]]:
         for part in parts:
-            for i, p, bends in zip(part.ids, part.properties, shapely.get_num_coordinates(part.geometry), strict=True):
+            for i, p in zip(part.ids, part.properties, strict=True):
                 if p.get("kind") != "node":
-                    yield i, p, bends
+                    yield i, p
 
-    def key(item: tuple[str, Properties, int]) -> tuple[bool, int, bool, int, str]:
-        i, p, _ = item
+    def key(item: tuple[str, Properties]) -> tuple[bool, int, bool, int, str]:
+        i, p = item
         rest = own(p, NAME)
         was = rest.get("index")
         known = isinstance(was, int)
@@ -1315,5 +1314,7 @@ register(
         write_options=_rmf.WriteOptions,
         extensions=(".building.yaml", ".yaml", ".yml"),
         choose=choose,
+        bends="nodes",
+        version=2,
     )
 )

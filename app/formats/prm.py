@@ -459,5 +459,7 @@ register(
         extensions=(".yaml", ".yml"),
         choose=choose,
         outlines=True,
+        bends="nodes",
+        version=2,
     )
 )

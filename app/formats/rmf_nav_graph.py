@@ -541,8 +541,7 @@ class _Writer:
         """The edges of a level by graph, in the order of their lanes."""
         out: dict[int, list[_Edge]] = {}
         for part in networks:
-            bends = shapely.get_num_coordinates(part.geometry)
-            for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
+            for i, p in zip(part.ids, part.properties, strict=True):
                 if p.get("kind") == "node":
                     continue
                 source, target = places.get(str(p.get("source"))), places.get(str(p.get("target")))
@@ -552,7 +551,6 @@ class _Writer:
                 elif graph is None:
                     self.lost[f"lanes of graphs that are not 0 to {MAX_GRAPHS - 1}"] += 1
                 else:
-                    self.lost["edges' bends between their nodes"] += int(bends[k] > 2)
                     self.lost["edges' actions"] += p.get("action") is not None
                     self.lost["edges' widths"] += p.get("width") is not None
                     if NAME not in p and BUILDING not in p:
@@ -841,5 +839,7 @@ register(
         extensions=(".yaml", ".yml"),
         choose=choose,
         joined=True,
+        bends="nodes",
+        version=2,
     )
 )

@@ -41,5 +41,7 @@ register(
         rank=49,
         extensions=(".tmap",),
         choose=_tmap.choose,
+        bends="nodes",
+        version=2,
     )
 )

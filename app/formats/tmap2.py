@@ -44,5 +44,7 @@ register(
         rank=50,
         extensions=(*NAMES, ".tmap"),
         choose=_tmap.choose,
+        bends="nodes",
+        version=2,
     )
 )

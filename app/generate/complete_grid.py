@@ -1,4 +1,9 @@
-"""The unknown part of a grid from its known part: wave-function collapse with the known cells fixed (``_wfc``)."""
+"""The unknown part of a grid from its known part, as far as that is sure.
+
+Walls that go on straight on the other side of an unknown place are continued. A cell becomes free where wave-function
+collapse with the known cells fixed (``_wfc``) says so, and cells that are surrounded like it are free often enough
+(``_evidence``). All others stay unknown: what is not known is never free. With ``confidence=0`` all are made up.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +16,7 @@ from numpy.typing import NDArray
 from app.derive import Notes
 from app.derive._grids import called, chosen
 from app.errors import CannotGenerate
-from app.generate import MAX_CELLS, Source, _wfc, generates
+from app.generate import MAX_CELLS, Source, _evidence, _wfc, generates
 from app.generate._site import refused
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import Layers, Part, PartKey
@@ -25,6 +30,9 @@ MOST = 2**20
 
 REPAIRS = 100_000
 
+HOLE = 2.0
+"""Metres of the holes that tell how sure a cell is, where the reach is not limited."""
+
 
 @dataclass(frozen=True, slots=True)
 class Options:
@@ -33,6 +41,13 @@ class Options:
     grid: str | None = parameter(None, "which grid; default: map, else the only one of a level that is no filter mask")
     reach: float = parameter(
         1.0, "unknown cells nearer than this to a known one are filled in; 0: all of them", minimum=0.0, maximum=1e6
+    )
+    confidence: float = parameter(
+        0.98,
+        "share of right cells, as holes cut into the known part show it, that free cells need: others stay unknown; 0: "
+        "all cells within reach are made up, as free or occupied",
+        minimum=0.0,
+        maximum=0.9999,
     )
     pattern: int = parameter(3, "cells along a window", minimum=2, maximum=3)
     symmetry: Literal["none", "mirror", "rotate", "all"] = parameter(
@@ -43,13 +58,13 @@ class Options:
     )
 
 
-@generates({"occupancy"}, parameters=Options, needs={"occupancy"})
+@generates({"occupancy"}, parameters=Options, needs={"occupancy"}, version=2)
 def complete_grid(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
-    """A grid's unknown cells, made up such that they look like the known ones.
+    """A grid's unknown cells as far as they are sure: walls that go on straight, free cells between free ones.
 
-    Known cells stay as they are. Every window of the result stands somewhere in the known part where that can be; how
-    many do not is told. Raises CannotGenerate where nothing is unknown, no window is known, or too much is to be
-    filled in.
+    Known cells stay as they are. Every window that was made up stands somewhere in the known part where that can be;
+    how many do not is told, and how many cells stay unknown. Raises CannotGenerate where nothing is unknown, no window
+    is known, nothing is sure, or too much is to be filled in.
     """
     parts: dict[PartKey, Part] = {}
     why = ""
@@ -79,16 +94,51 @@ def _completed(grid: OccupancyGrid, options: Options, source: Source, notes: Not
     counts = _counts(occupied, known, n, options.symmetry)
     if not counts.any():
         raise CannotGenerate(f"{name}: no window of {n} × {n} cells is known all over, so nothing can be learned")
+    cells = grid.cells.copy()
+    before = _evidence.Grid(occupied, known, grid.resolution)
+    wall = _evidence.walls(before, wanted)
+    cells[wall] = OCCUPIED
+    occupied, known, wanted = occupied | wall, known | wall, wanted & ~wall
+    if options.confidence:
+        side = min(2 * options.reach or HOLE, _evidence.SPAN_METRES)
+        share = _evidence.confidence(before, side, source.stream(f"{key.level}/{key.name}/holes"))
+        at = np.argwhere(wanted)
+        kind = _evidence.surroundings(_evidence.Grid(occupied, known, grid.resolution), at)
+        wanted = np.zeros_like(wanted)
+        wanted[tuple(at[share[kind] >= options.confidence].T)] = True
+        if not wanted.any() and not wall.any():
+            reason = f"{name}: no unknown cell is that sure: give a lower confidence, or a smaller reach"
+            raise refused("confidence", reason)
+    if wanted.any():
+        _fill(cells, occupied, known, wanted, counts, options, source, notes, key)
+    if options.confidence:
+        left = count - int(np.count_nonzero((cells != UNKNOWN) & (grid.cells == UNKNOWN)))
+        why = f"they stay unknown: free cells need a confidence of {options.confidence:g}"
+        notes.drop("unknown cells", left, f"{name}: {why}")
+    return replace(grid, cells=cells)
+
+
+def _fill(
+    cells: U8,
+    occupied: Bool,
+    known: Bool,
+    wanted: Bool,
+    counts: NDArray[np.int64],
+    options: Options,
+    source: Source,
+    notes: Notes,
+    key: PartKey,
+) -> None:
+    """Make up the wanted cells, in place. What is not free stays unknown unless all is to be made up."""
+    n = options.pattern
     # Only what is near the wanted cells is looked at.
     rows, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
     y0, y1 = max(int(rows[0]) - n, 0), int(rows[-1]) + n + 1
     x0, x1 = max(int(columns[0]) - n, 0), int(columns[-1]) + n + 1
     part = np.s_[y0:y1, x0:x1]
     tiles = _filled(occupied[part], known[part], wanted[part], counts, options, source, notes, key)
-    cells = grid.cells.copy()
     inside = cells[part]
-    inside[wanted[part]] = np.where(tiles == 1, OCCUPIED, FREE).astype(np.uint8)[wanted[part]]
-    return replace(grid, cells=cells)
+    inside[wanted[part]] = np.where(tiles == 1, UNKNOWN if options.confidence else OCCUPIED, FREE)[wanted[part]]
 
 
 def _filled(

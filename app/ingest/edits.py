@@ -22,7 +22,7 @@ from app.ingest.prepare import moved
 from app.model.features import NO_GEOMETRY, Features, Properties
 from app.model.frame import GROUND, MAX_METRES, Datum, Level
 from app.model.geodesy import LocalFrame, local_frame
-from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid, without_unknown_grey
 from app.model.layers import NETWORK, SITE, VECTOR_LAYERS, ZONES, Layer, PartKey, join_levels
 from app.model.names import did_you_mean
 from app.store import Store
@@ -413,6 +413,7 @@ class _Session:
         cells = grid.cells.copy()
         cells[mask] = value
         # Once people have drawn in it, a grid tells more than the objects that it was a slice of.
+        grid = without_unknown_grey(grid, mask)
         said = {word: value for word, value in grid.properties.items() if word != "slice"}
         self._grids[key] = replace(grid, cells=cells, properties=said)
 

@@ -20,6 +20,7 @@ topology   ``width``         metres of free width along an edge
 topology   ``surface``       what an edge's ground is made of (``asphalt``, ``gravel``: OpenStreetMap's words)
 topology   ``access``        who may use an edge (``yes``, ``private``, ``no`` …: OpenStreetMap's words)
 topology   ``stairs``        true where an edge goes over steps
+topology   ``bends``         what a file of straight edges says of the nodes at an edge's bends (``app.model.bends``)
 topology   ``blocked``       true: nobody is to take the edge, until ``blocked_until`` (an RFC 3339 time)
 zones      ``value``         what the kind needs: a speed in m/s, a priority …
 zones      ``expires``       RFC 3339 time at which the zone ends

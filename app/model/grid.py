@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import math
+import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -88,6 +90,46 @@ class OccupancyGrid:
         occupied, free, unknown = (int(np.count_nonzero(self.cells == v)) for v in (OCCUPIED, FREE, UNKNOWN))
         other = int(self.cells.size) - occupied - free - unknown
         return {"occupied": occupied, "free": free, "unknown": unknown, "other": other}
+
+
+UNKNOWN_GREY = "unknown_grey"
+"""Word among a grid's properties: the free cells whose grey is map_saver's for unknown (205). Nav2 takes them as free,
+since the grid's free_thresh says so; whether anybody has seen them is not known."""
+
+
+def packed_cells(chosen: NDArray[np.bool_]) -> dict[str, Any]:
+    """Chosen cells of a grid, bool [height, width], as a JSON-like value."""
+    packed = zlib.compress(np.packbits(chosen).tobytes(), 9)
+    return {"height": chosen.shape[0], "width": chosen.shape[1], "bits": base64.b64encode(packed).decode()}
+
+
+def unknown_grey(grid: OccupancyGrid) -> NDArray[np.bool_] | None:
+    """The free cells of a grid that have the grey of unknown ones; None where there are none."""
+    known = grid.properties.get(UNKNOWN_GREY)
+    if not isinstance(known, Mapping) or [known.get("height"), known.get("width")] != [grid.height, grid.width]:
+        return None
+    size = (grid.cells.size + 7) // 8
+    try:
+        bits = zlib.decompressobj().decompress(base64.b64decode(str(known.get("bits"))), size)
+    except (ValueError, zlib.error):
+        return None
+    if len(bits) != size:
+        return None
+    chosen = np.unpackbits(np.frombuffer(bits, np.uint8), count=grid.cells.size)
+    out = chosen.astype(bool).reshape(grid.height, grid.width) & (grid.cells == FREE)
+    return out if out.any() else None
+
+
+def without_unknown_grey(grid: OccupancyGrid, seen: NDArray[np.bool_] | None = None) -> OccupancyGrid:
+    """The grid after people have said what these cells are (seen: bool [height, width]; None: all of them)."""
+    if UNKNOWN_GREY not in grid.properties:
+        return grid
+    rest = {word: value for word, value in grid.properties.items() if word != UNKNOWN_GREY}
+    grey = None if seen is None else unknown_grey(grid)
+    left = None if grey is None or seen is None else grey & ~seen
+    if left is not None and left.any():
+        rest[UNKNOWN_GREY] = packed_cells(left)
+    return replace(grid, properties=rest)
 
 
 def _beyond(cells: NDArray[np.uint8]) -> bool:

@@ -151,13 +151,14 @@ def _metres(drawing: _Drawing, frame: LocalFrame | None) -> Metres:
         if local.any():
             # Says how to give the environment a datum.
             drawing.objects.in_local(None)
-        frame = _middle(flat)
+        frame = middle_frame(flat)
     out = flat.copy()
     out[~local] = frame.to_local(flat[~local])
     return out
 
 
-def _middle(lonlat: Metres) -> LocalFrame:
+def middle_frame(lonlat: Metres) -> LocalFrame:
+    """A local frame at the middle of places on earth: float64 [n, 2], longitude and latitude."""
     longitude = lonlat[:, 0]
     if longitude.max() - longitude.min() > 180.0:
         longitude = np.where(longitude < 0.0, longitude + 360.0, longitude)

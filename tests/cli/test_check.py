@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
+from app.cli.companions import with_companions
+from app.cli.folder import single
 from tests.cli.conftest import Fleetmap
 
 YAML = "image: {image}\nresolution: 0.05\norigin: [0, 0, {yaw}]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
@@ -61,3 +66,67 @@ def test_what_is_no_map_is_said(offline: Fleetmap, tmp_path: Path) -> None:
     named = offline("check", tmp_path / "note.txt", "--format", "nav2_route")
     assert named.status == 1
     assert "would be refused" in named.out
+
+
+def test_the_picture_beside_a_named_file_is_read(offline: Fleetmap, tmp_path: Path) -> None:
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    path = a_map(folder, image="/home/somebody/map.pgm")
+    (tmp_path / "map.pgm").write_bytes(b"P5 1 1 255\n\0")
+    told = offline("check", path, "--json")
+    assert [(line["file"], line["result"]) for line in told.json["maps"]] == [("map.yaml", "warning")]
+    a_map(folder)
+    told = offline("check", path, "--json")
+    assert (told.status, told.json["maps"][0]["result"], told.json["unknown"]) == (0, "fine", [])
+    out = tmp_path / "out"
+    told = offline("convert", path, "--to", "occupancy_grid", "-o", f"{out}/")
+    assert told.status == 0, told.err
+    assert (out / "map.pgm").read_bytes().endswith(bytes([0, 254, 205, 254]))
+
+
+def test_files_outside_of_a_maps_folder_are_not_read(offline: Fleetmap, tmp_path: Path) -> None:
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    (tmp_path / "other.pgm").write_bytes(b"P5 2 2 255\n" + bytes(4))
+    (folder / "linked.pgm").symlink_to(tmp_path / "other.pgm")
+    for image in ("../other.pgm", str(tmp_path / "other.pgm"), "linked.pgm"):
+        told = offline("convert", a_map(folder, image=image), "--to", "occupancy_grid", "-o", "-")
+        assert told.status == 1, image
+        assert "is not in the upload" in told.err
+
+
+WORLD = """<sdf version="1.9"><world name="w"><include><uri>model://crate</uri></include></world></sdf>"""
+MODEL = """<sdf version="1.9"><model name="crate"><static>true</static><link name="l"><collision name="c">
+<geometry><box><size>1 1 1</size></box></geometry></collision></link></model></sdf>"""
+CONFIG = """<model><name>crate</name><sdf version="1.9">model.sdf</sdf></model>"""
+
+
+def test_companions_are_those_that_each_format_names(shared: Path, tmp_path: Path) -> None:
+    """A building's floor plans, a world's models below it, a picture's world file; nothing else of the folder."""
+    crate = tmp_path / "models" / "crate"
+    crate.mkdir(parents=True)
+    (tmp_path / "w.world").write_text(WORLD)
+    (crate / "model.sdf").write_text(MODEL)
+    (crate / "model.config").write_text(CONFIG)
+    Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "field.png")
+    (tmp_path / "field.pgw").write_text("1\n0\n0\n-1\n0\n0\n")
+    (tmp_path / "other.pgw").write_text("1\n0\n0\n-1\n0\n0\n")
+    hotel = shared / "data" / "openrmf_building" / "hotel" / "hotel.building.yaml"
+    expected = {
+        tmp_path / "w.world": {"models/crate/model.sdf", "models/crate/model.config"},
+        tmp_path / "field.png": {"field.pgw"},
+        tmp_path / "field.pgw": {"field.png"},
+        hotel: {f"hotel_L{n}.png" for n in (1, 2, 3)},
+    }
+    for path, names in expected.items():
+        found = with_companions([single(path)])
+        assert {f.name for f in found} == {path.name} | names
+    named = with_companions([single(tmp_path / "field.png"), single(tmp_path / "other.pgw", "field.pgw")])
+    assert [f.path.name for f in named] == ["field.png", "other.pgw"], "what the user names stays"
+
+
+def test_a_wrong_option_of_a_generator_lists_its_own(offline: Fleetmap, tmp_path: Path) -> None:
+    told = offline("generate", "orchard", "--to", "tmap2", "-o", tmp_path / "n.yaml", "-O", "typo=1")
+    assert told.status == 1
+    assert "typo: no such parameter of orchard; accepted: crown_diameter," in told.err
+    assert "tmap2 accepts action," in told.err

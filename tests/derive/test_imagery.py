@@ -205,6 +205,10 @@ def test_a_near_infrared_band_gives_the_ndvi() -> None:
     notes = Notes()
     green = objects(layers(unsaid), notes, segmentation="index")
     assert shapely.total_bounds(green.geometry)[2] == pytest.approx(60.0, abs=0.5)
+    untagged = local(pixels, bands=[{"colour": c} for c in ("grey", *["undefined"] * 3)])
+    assert len(objects(layers(untagged), segmentation="index", near_infrared=4))
+    with pytest.raises(CannotConvert, match="does not say which of its bands are red, green and blue: tag them"):
+        objects(layers(untagged), segmentation="colour")
     with pytest.raises(CannotConvert, match="no band 9"):
         objects(layers(unsaid), segmentation="index", near_infrared=9)
 

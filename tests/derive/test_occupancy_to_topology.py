@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from app import derive, parameters
+from app import derive, formats, parameters
 from app.bundle import Hints, Known, read
 from app.derive import Notes
-from app.derive.occupancy_to_topology import Parameters, occupancy_to_topology
+from app.derive.occupancy_to_topology import Parameters, network, occupancy_to_topology
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingLayer, NotFound
-from app.formats import Limits
+from app.formats import Limits, ReadContext, WriteContext
 from app.model.features import Features
 from app.model.frame import Level
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey, without_unknown_grey
 from app.model.layers import NETWORK, Layers, PartKey
 
 METHODS = ("skeleton", "roadmap", "voronoi")
@@ -367,6 +367,8 @@ def test_grids_without_ways_say_what_to_do(method: str) -> None:
     spot[4, 4] = FREE
     assert "too few for a way" in bad(spot, method=method, robot_radius=0.0)
     assert "'map' of level 'ground'" in bad(spot, method=method, robot_radius=0.0)
+    if method != "roadmap":
+        assert "give a spacing above 0" in bad(spot, method=method, robot_radius=0.0, spacing=0.0)
 
 
 def test_thresholds_in_between_are_not_free() -> None:
@@ -496,3 +498,51 @@ def test_the_strawberry_map_gives_what_was_drawn_by_hand(
         h.remove_nodes_from(["a", "b"])
     assert total == 413
     assert good / total >= ways
+
+
+# --- cells of unknown's grey ---
+
+
+def seen_in_part(free_thresh: float) -> dict[str, bytes]:
+    """A map as map_saver writes it: a seen room (254), its walls (0), and what nobody has seen (205) on the right."""
+    pixels = np.full((60, 120), 205, np.uint8)
+    pixels[5:55, 5:55] = 254
+    pixels[[4, 55], 4:56] = 0
+    pixels[4:56, 4] = 0
+    head = "image: map.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\n"
+    text = f"{head}free_thresh: {free_thresh}\n"
+    return {"map.yaml": text.encode(), "map.pgm": b"P5\n120 60\n255\n" + pixels.tobytes()}
+
+
+def test_no_way_leads_where_the_grey_of_unknown_is_called_free() -> None:
+    files = seen_in_part(0.25)
+    ((key, grid),) = formats.read(formats.group(files)[0][0], ReadContext()).grids().items()
+    assert int((grid.cells == FREE).sum()) == 7200 - 154, "what Nav2 makes of the file stays"
+    notes = Notes()
+    made = network(grid, Parameters(), notes, "the map")
+    assert shapely.total_bounds(made.geometry)[2] < 5.6
+    (told,) = [w.problem for w in notes.warnings if "grey 205" in w.problem]
+    assert "4546 cells" in told
+    assert "unknown_grey=free takes them as free" in told
+    notes = Notes()
+    made = network(grid, Parameters(unknown_grey="free"), notes, "the map")
+    assert shapely.total_bounds(made.geometry)[2] > 8
+    assert "ways may lead where nobody has been" in notes.warnings[0].problem
+
+    written = formats.write(formats.get_format("occupancy_grid"), Layers({key: grid}), WriteContext())
+    assert written["map.pgm"] == files["map.pgm"], "the picture keeps its greys"
+    ((_, again),) = formats.read(formats.group(written)[0][0], ReadContext()).grids().items()
+    assert again.properties == grid.properties
+    usual = formats.read(formats.group(seen_in_part(0.196))[0][0], ReadContext()).grids()
+    assert [g.properties for g in usual.values()] == [{}]
+
+
+def test_cells_that_people_draw_are_no_longer_doubtful() -> None:
+    ((_, grid),) = formats.read(formats.group(seen_in_part(0.25))[0][0], ReadContext()).grids().items()
+    drawn = np.zeros(grid.cells.shape, bool)
+    drawn[:, 60:] = True
+    before, after = unknown_grey(grid), unknown_grey(without_unknown_grey(grid, drawn))
+    assert before is not None
+    assert after is not None
+    assert (after == before & ~drawn).all()
+    assert without_unknown_grey(grid).properties == {}

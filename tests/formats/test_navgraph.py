@@ -249,7 +249,7 @@ def cross(**more: Any) -> Features:
     for k, (a, b) in enumerate(pairs):
         p = {"kind": "edge", "source": a, "target": b, "speed_limit": 1.0}
         rows.append((f"e{k}", shapely.LineString([at[a], at[b]]), p))
-    bent = shapely.LineString([at["W"], (0, 1), at["E"]])
+    bent = shapely.LineString([at["W"], (0, 9), at["E"]])
     rows.append(("bent", bent, {"kind": "edge", "source": "W", "target": "E", **more}))
     return features(rows, "local")
 
@@ -264,18 +264,18 @@ def test_a_network_of_another_format_is_one_that_fawkes_takes() -> None:
         frozenset("SN"): False,
         frozenset("ES"): True,
         frozenset("NW"): False,
+        frozenset(("W", "E~W~1")): True,
+        frozenset(("E~W~1", "E")): True,
     }
     assert graph.properties["W"] == {"name": "West gate", "floor": "2"}
     assert served.count("!allow-intersection") == 2
     assert {d["what"]: d["count"] for d in told.dropped} == {
         "altitudes of nodes": 1,
-        "ids of edges": 8,
+        "ids of edges": 9,
         "edges with attributes (action, speed limit …)": 7,
-        "edges' bends between their nodes": 1,
-        "parallel edges": 1,
         "attributes of nodes that are no scalars": 1,
     }
-    assert {t["what"] for t in told.template} == {"graph-name", "nodes: !unconnected"}
+    assert {t["what"] for t in told.template} == {"graph-name", "nodes: !unconnected", "nodes at bends"}
     assert next(t["option"] for t in told.template if t["what"] == "graph-name") == "graph_name"
     assert told.warnings == []
     assert write(read(served)[0])[0] == served

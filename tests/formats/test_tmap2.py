@@ -361,8 +361,8 @@ def test_a_network_from_elsewhere_gets_defaults_and_keeps_its_attributes() -> No
     check_schema(top)
     assert (top["name"], top["metric_map"], top["pointset"]) == ("farm", "farm", "farm")
     assert top["meta"]["last_updated"] == _tmap.EPOCH
-    n1, n2, n10 = (n["node"] for n in top["nodes"])
-    assert [n["name"] for n in (n1, n2, n10)] == ["n1", "n2", "n10"]
+    n1, n2, n10, bend = (n["node"] for n in top["nodes"])
+    assert [n["name"] for n in (n1, n2, n10, bend)] == ["n1", "n2", "n10", "n1~n10~1"]
     assert n1["pose"]["position"] == {"x": 0.0, "y": 0.0, "z": 0.0}
     assert n10["pose"]["position"]["x"] == pytest.approx(66.72, abs=0.01)
     assert n2["pose"]["position"]["y"] == pytest.approx(111.30, abs=0.01)
@@ -378,11 +378,8 @@ def test_a_network_from_elsewhere_gets_defaults_and_keeps_its_attributes() -> No
     assert edge["properties"] == {"speed_limit": 1.5, "width": 3, "name": "Lane"}
     assert edge["restrictions_planning"] == "True"
     assert n10["edges"][0]["action"] == "row_traversal"
-    assert {d["what"]: d["count"] for d in told.dropped} == {
-        "edges' bends between their nodes": 1,
-        "osm tags and attributes": 2,
-    }
-    assert {"metric_map", "name", "pointset", "transformation"} <= {t["what"] for t in told.template}
+    assert {d["what"]: d["count"] for d in told.dropped} == {"osm tags and attributes": 2}
+    assert {"nodes at bends", "metric_map", "name", "pointset", "transformation"} <= {t["what"] for t in told.template}
 
     back = network(read(served)[0])
     by_id = dict(zip(back.ids, back.properties, strict=True))
@@ -404,7 +401,7 @@ def test_options_say_what_edges_do_and_whether_osm_is_written() -> None:
     edge = top["nodes"][0]["node"]["edges"][0]
     assert (edge["action"], edge["action_type"]) == ("NavigateToPose", "nav2_msgs/NavigateToPose")
     assert edge["properties"]["osm"] == {"way": 1}
-    assert [d["what"] for d in told.dropped] == ["edges' bends between their nodes"]
+    assert told.dropped == []
     back = network(read(served)[0])
     assert back.properties[back.index()["n10"]]["osm"] == {"tags": {"a": "b"}}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +125,31 @@ def serves(layers: Layers) -> dict[str, list[dict[str, Any]]]:
         errors = [w for w in made.report["warnings"] if w.get("level") == "error"]
         assert not errors, (name, errors)
         out[name] = made.report["dropped"]
+        if "topology" in known.carries and not known.holds:
+            clear_of_obstacles(layers, known, made.files)
     return out
+
+
+def clear_of_obstacles(layers: Layers, known: formats.Format, files: dict[str, bytes]) -> None:
+    """No edge of what was written leads through an occupied cell: as its shape in formats that have some, else straight
+    from node to node. Cells are looked up along each line, so that the server's own check is not asked."""
+    shaped = known.bends == "shape"
+    grids = {k.level: g for k, g in layers.grids().items()}
+    for group in formats.group(files, known.name)[0]:
+        assert known.read is not None
+        context = ReadContext(frame=layers.frame, main=group.main, options=known.read_options())
+        read = replace(known.read(group.files, context), datum=layers.datum)
+        for key, part in read.vector("topology").items():
+            grid = grids.get(key.level) or next(iter(grids.values()))
+            at = dict(zip(part.ids, part.in_local(layers.frame), strict=True))
+            for i, p in zip(part.ids, part.properties, strict=True):
+                if p["kind"] != "edge" or len(read.vector("topology")) < len(grids):  # levels are joined
+                    continue
+                line = at[i] if shaped else shapely.LineString([at[p["source"]], at[p["target"]]])
+                steps = np.arange(0.0, line.length, grid.resolution / 2)
+                xy = shapely.get_coordinates(shapely.line_interpolate_point(line, steps))
+                column, row = ((xy - grid.origin[:2]) / grid.resolution).astype(int).T
+                assert not (grid.cells[row, column] == OCCUPIED).any(), (known.name, i)
 
 
 def over_http(api: Api, name: str, formats_: tuple[str, ...], **values: Any) -> dict[str, Any]:

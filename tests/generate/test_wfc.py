@@ -246,13 +246,13 @@ def completed(cells: U8, seed: int = 7, **values: Any) -> tuple[U8, Notes]:
 @pytest.mark.parametrize("order", ["rows", "entropy"])
 def test_an_unknown_part_is_made_of_what_is_known(order: str) -> None:
     whole, cells = holed()
-    out, notes = completed(cells, reach=0, order=order, symmetry="none")
+    out, notes = completed(cells, reach=0, confidence=0, order=order, symmetry="none")
     assert (out == cells)[cells != UNKNOWN].all()
     assert set(np.unique(out[cells == UNKNOWN])) <= {FREE, OCCUPIED}
     plain = np.where(out >= 65, OCCUPIED, FREE).astype(np.uint8)
     strange = windows(plain[37:73, 47:93], 3) - windows(whole, 3)
     assert len(strange) <= sum("stand nowhere" in w.problem for w in notes.warnings) * 40
-    near, _ = completed(cells, reach=0.25, order=order)
+    near, _ = completed(cells, reach=0.25, confidence=0, order=order)
     filled = (near != UNKNOWN) & (cells == UNKNOWN)
     assert 0 < filled.sum() < (cells == UNKNOWN).sum()
     assert not filled[46:64, 56:84].any(), "what is farther than the reach stays unknown"
@@ -262,16 +262,16 @@ def test_completing_is_the_same_everywhere() -> None:
     cells = np.full((20, 20), UNKNOWN, np.uint8)
     cells[:8] = board()[0, 0]
     cells[3:5, 4:16] = OCCUPIED
-    out, _ = completed(cells, reach=0.3)
+    out, _ = completed(cells, reach=0.3, confidence=0)
     assert hashlib.sha256(out.tobytes()).hexdigest()[:16] == COMPLETED
-    assert out.tobytes() == completed(cells, reach=0.3)[0].tobytes()
+    assert out.tobytes() == completed(cells, reach=0.3, confidence=0)[0].tobytes()
 
 
 def test_known_cells_that_fit_no_pattern_are_gone_around(shared: Path) -> None:
     with Image.open(shared / "data" / "occupancy_grid" / "nav2_tb3_sandbox" / "tb3_sandbox.pgm") as picture:
         grey = np.asarray(picture.convert("L"))[::-1]
     cells = np.where(grey < 90, OCCUPIED, np.where(grey > 220, FREE, UNKNOWN)).astype(np.uint8)
-    out, notes = completed(cells, reach=0.4)
+    out, notes = completed(cells, reach=0.4, confidence=0)
     assert (out == cells)[cells != UNKNOWN].all()
     assert (out == UNKNOWN).sum() < (cells == UNKNOWN).sum()
     assert all("stand nowhere in the known part" in w.problem for w in notes.warnings)

@@ -1,0 +1,79 @@
+"""Files that belong to maps which the user names: a grid's picture, a building's floor plans, a world's models.
+
+The rules are those of an upload of the folder: only files beside or below a map count, and only those that its format
+says it names. It needs the server's code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from app.cli.client import LocalFile
+from app.cli.folder import single, walk
+
+MAX_LISTED = 20_000
+"""Maximum number of files below a map's folder that are looked at by name."""
+
+
+def with_companions(files: Sequence[LocalFile]) -> list[LocalFile]:
+    """Add the companions of files that are named by themselves; a name that is taken stays."""
+    out = {file.name: file for file in files}
+    for file in files:
+        if "/" in file.name or file.path.name != file.name:  # of a folder, which is taken with all its files
+            continue
+        beside = _Beside(file.path)
+        # A picture says nothing of itself: what speaks for it is a file of its name (a world file, a YAML).
+        same = [n for n in beside if "/" not in n and n != file.name and _stem(n) == _stem(file.name)]
+        speaking = [n for n in same if file.name in _companions(n, beside)]
+        for name in [*_companions(file.name, beside), *speaking]:
+            out.setdefault(name, single(beside.path(name), name))
+    return list(out.values())
+
+
+def _stem(name: str) -> str:
+    return name.rpartition(".")[0].lower()
+
+
+def _companions(main: str, beside: _Beside) -> list[str]:
+    """The files that a map names, of those beside and below it; none if it is no map."""
+    from app import formats
+
+    known = formats.detect(main, beside[main])
+    if known is None:
+        return []
+    if known.sort is not None:
+        wanted = known.sort(beside, [main]).get(main, ())
+    else:
+        names = list(beside)
+        wanted = [*known.companions(main, beside[main], names), *known.looks_at(main, names)]
+    return [name for name in wanted if name in beside and name != main]
+
+
+class _Beside(Mapping[str, bytes]):
+    """The files beside and below a map by name, read when they are needed."""
+
+    def __init__(self, path: Path) -> None:
+        folder = path.resolve().parent
+        self._paths = {path.name: path}
+        for found in walk(folder, MAX_LISTED):
+            self._paths.setdefault(found.relative_to(folder).as_posix(), found)
+        self._read: dict[str, bytes] = {}
+
+    def path(self, name: str) -> Path:
+        """Where a file is."""
+        return self._paths[name]
+
+    def __getitem__(self, name: str) -> bytes:
+        if name not in self._read:
+            self._read[name] = self._paths[name].read_bytes()
+        return self._read[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._paths
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._paths)
+
+    def __len__(self) -> int:
+        return len(self._paths)

@@ -1,0 +1,163 @@
+"""Edges of a network that lead through obstacles: a check of the network that a map holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.derive._obstacles import body_of
+from app.errors import FleetMapError, Invalid, MissingDatum, Problem
+from app.model import masks
+from app.model.features import Features, Properties
+from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.layers import MAP, Layers, PartKey
+from app.model.solids import Solids
+
+Array = NDArray[np.float64]
+
+BODIES = frozenset({"building", "wall", "fence", "barrier", "railing", "hedge", "rack", "shelf", "container"})
+"""Kinds whose ground plan no robot crosses."""
+
+CLEARANCE_METRES = 2.0
+"""Minimum height of an underside that robots pass under, in metres."""
+
+MIN_CROSSING_METRES = 0.1
+"""Minimum length of an edge inside a ground plan, in metres."""
+
+MAX_EDGES, MAX_BODIES = 500_000, 50_000
+"""What is checked of one level: more would slow a map down."""
+
+SAMPLES, MAX_SAMPLES = 2**20, 2**25
+"""Places along edges that are looked up at once, and in all: of a longer network they are farther apart."""
+
+LISTED = 5
+
+
+def crossings(networks: Layers, around: Layers, *, straight: bool) -> list[Problem]:
+    """Warn of edges that cross occupied cells of their level's grid or, if it has no grid, a building or a wall.
+
+    Args:
+        networks: the network as it is written.
+        around: the grids and objects that are in memory.
+        straight: robots drive straight from node to node, whatever an edge's shape.
+
+    Networks on earth are not checked while there is no datum, or one that is far away.
+    """
+    out: list[Problem] = []
+    for key, part in networks.vector("topology").items():
+        grids = {k: g for k, g in around.grids().items() if k.level == key.level}
+        grid_key = _obstacle_grid(grids)
+        bodies = _bodies(around, key.level) if grid_key is None else []
+        edges = [k for k, p in enumerate(part.properties) if p.get("kind") == "edge"][:MAX_EDGES]
+        if not edges or (grid_key is None and not bodies):
+            continue
+        try:
+            geometry = part.in_local(networks.frame)
+        except (MissingDatum, Invalid):
+            continue
+        segments, owner = _segments(part, geometry, edges, straight=straight)
+        if grid_key is not None:
+            hit, what = _in_grid(segments, grids[grid_key]), f"occupied cells of the occupancy grid {grid_key.name!r}"
+        else:
+            hit, what = _in_bodies(segments, bodies), "buildings or walls"
+        ids = [part.ids[edges[n]] for n in np.unique(owner[hit]).tolist()]
+        if ids:
+            count = "1 edge crosses" if len(ids) == 1 else f"{len(ids)} edges cross"
+            named = ", ".join(ids[:LISTED]) + (" …" if len(ids) > LISTED else "")
+            reason = f"{count} {what}: {named}; a robot that follows the network meets an obstacle there"
+            out.append(Problem(reason, where=f"topology {key.level}/{key.name}"))
+    return out
+
+
+def _segments(
+    part: Features, geometry: NDArray[np.object_], edges: Sequence[int], *, straight: bool
+) -> tuple[Array, NDArray[np.int64]]:
+    """The straight pieces of edges as float64 [n, 2, 2] in metres, and the place of each piece's edge in ``edges``."""
+    shapes = geometry[list(edges)]
+    if straight:
+        shapes = shapes.copy()
+        point = shapely.get_type_id(geometry) == 0
+        nodes = {i: g for i, g, is_point in zip(part.ids, geometry, point, strict=True) if is_point and not g.is_empty}
+        for n in np.flatnonzero(shapely.get_num_coordinates(shapes) > 2).tolist():
+            p = part.properties[edges[n]]
+            ends = [nodes.get(str(p.get(word))) for word in ("source", "target")]
+            if ends[0] is not None and ends[1] is not None:
+                shapes[n] = shapely.LineString([(end.x, end.y) for end in ends if end is not None])
+    at, owner = shapely.get_coordinates(shapes, return_index=True)
+    same = owner[1:] == owner[:-1]
+    return np.stack([at[:-1], at[1:]], axis=1)[same], owner[:-1][same].astype(np.int64)
+
+
+def _obstacle_grid(grids: Mapping[PartKey, OccupancyGrid]) -> PartKey | None:
+    """A level's grid of obstacles: ``map``, else the only one that is no costmap filter mask."""
+    found = [k for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties]
+    return next((k for k in found if k.name == MAP), found[0] if len(found) == 1 else None)
+
+
+def _in_grid(segments: Array, grid: OccupancyGrid) -> NDArray[np.bool_]:
+    """Which pieces lead through an occupied cell, looked up twice a cell."""
+    x, y, yaw = grid.origin
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    turned = (segments - np.array([x, y])) @ np.array([[cosine, -sine], [sine, cosine]])
+    hit = np.zeros(len(segments), bool)
+    length = np.hypot(*(turned[:, 1] - turned[:, 0]).T)
+    step = max(grid.resolution / 2, float(length.sum()) / MAX_SAMPLES)
+    count = np.ceil(length / step).astype(np.int64) + 1
+    bound = np.concatenate([[0], np.cumsum(count)])
+    begin = 0
+    while begin < len(turned):
+        end = max(begin + 1, int(np.searchsorted(bound, bound[begin] + SAMPLES, side="right")) - 1)
+        number = np.repeat(np.arange(begin, end), count[begin:end])
+        share = (np.arange(len(number)) + bound[begin] - bound[number]) / (count[number] - 1).clip(1)
+        at = turned[number, 0] + (turned[number, 1] - turned[number, 0]) * share[:, None]
+        column, row = np.floor(at / grid.resolution).astype(np.int64).T
+        inside = (row >= 0) & (row < grid.height) & (column >= 0) & (column < grid.width)
+        cells = grid.cells[row[inside], column[inside]]  # not of the whole grid, which may have 300 million
+        occupied = (cells >= grid.occupied_thresh * OCCUPIED) & (cells != UNKNOWN)
+        hit[number[inside][occupied]] = True
+        begin = end
+    return hit
+
+
+def _bodies(around: Layers, level: str) -> list[Any]:
+    """The ground plans of a level's buildings and walls, in metres."""
+    bodies: list[Any] = []
+    solids = Solids({})
+    for key, part in around.vector("objects").items():
+        rows = [k for k, p in enumerate(part.properties) if _is_body(p)] if key.level == level else []
+        chosen = part.take(rows[: MAX_BODIES - len(bodies)])
+        try:
+            shapes = chosen.in_local(around.frame)
+        except (MissingDatum, Invalid):
+            continue
+        for p, geometry in zip(chosen.properties, shapes, strict=True):
+            try:
+                body = body_of({**p, "shapes": None}, geometry, solids)
+            except FleetMapError:  # what it is made of cannot be used: its derivations report it
+                continue
+            if body is not None and not body.is_empty:
+                bodies.append(body)
+    return bodies
+
+
+def _in_bodies(segments: Array, bodies: Sequence[Any]) -> NDArray[np.bool_]:
+    """Which pieces lead through a ground plan, from outside to outside."""
+    hit = np.zeros(len(segments), bool)
+    grounds, pieces = np.array(bodies, object), shapely.linestrings(segments)
+    piece, ground = shapely.STRtree(grounds).query(pieces, predicate="crosses")
+    ends = shapely.points(segments.reshape(-1, 2)).reshape(-1, 2)[piece]
+    outside = ~shapely.intersects(ends, grounds[ground][:, None]).any(axis=1)
+    piece, ground = piece[outside], ground[outside]
+    inside = shapely.length(shapely.intersection(pieces[piece], grounds[ground]))
+    hit[piece[inside >= MIN_CROSSING_METRES]] = True
+    return hit
+
+
+def _is_body(properties: Properties) -> bool:
+    base = properties.get("base")
+    raised = isinstance(base, (int, float)) and base >= CLEARANCE_METRES
+    return properties.get("kind") in BODIES and not raised

@@ -1,0 +1,378 @@
+"""Edges with bends for formats whose edges are straight: nodes at the bends, and the edges that they were.
+
+A robot that drives straight between the nodes of a bent edge cuts the corner, through whatever stands there. So such a
+format gets a node ``<a>~<b>~1``, ``<a>~<b>~2`` … at each bend of an edge between the nodes a and b (a before b in the
+alphabet, counted from a; both directions share them), and the edge ``e`` becomes ``e~1``, ``e~2`` … from its source.
+The names follow from the network alone, so they stay when a robot gets the map again. ``join`` recognises them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import defaultdict
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from app.model.features import MAX_ID, Features, Properties, unique_ids
+from app.model.geodesy import LocalFrame
+from app.model.layers import Layers, Part, PartKey
+from app.model.network import middle_frame
+
+TOLERANCE_METRES = 0.05
+"""Maximum distance of a straight edge from the bent one, in metres: vertices that matter less are no bends."""
+
+IDENTITY = frozenset({"id", "edge_id", "index", "line", "backward", "geometry"})
+"""Words by which formats identify one edge of a file, or its place in it: pieces of an edge do not have them."""
+
+NAMED = re.compile(r"(.+)~([1-9][0-9]{0,5})\Z", re.DOTALL)
+BENDS = "bends"
+"""Word of an edge: the properties of the nodes at its bends in the file that it came from, from the lower end on."""
+
+POINT, LINE = 0, 1
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """What was split. edges: number of bent edges. nodes: number of nodes at bends."""
+
+    edges: int = 0
+    nodes: int = 0
+
+
+# --- on the way out ---
+
+
+def split(layers: Layers, shape_of: str | None = None) -> tuple[Layers, Split]:
+    """Split the bent edges of all networks. Layers without such edges are returned as they are.
+
+    Args:
+        shape_of: a format with shapes that its consumers ignore: edges that it identifies keep theirs.
+
+    Networks of both anchors stay as they are while there is no datum: their writers report it.
+    """
+    parts: dict[PartKey, Part] = {}
+    total = Split()
+    networks = layers.vector("topology")
+    if not any((shapely.get_num_coordinates(part.geometry) > 2).any() for part in networks.values()):
+        return layers, total
+    nodes: dict[str, set[str]] = defaultdict(set)
+    for key, part in networks.items():
+        nodes[key.level].update(i for i, p in zip(part.ids, part.properties, strict=True) if p.get("kind") == "node")
+    for key, part in networks.items():
+        places = _bent(part, nodes[key.level], shape_of)
+        if len(places) and (part.local.all() or not part.local.any() or layers.frame is not None):
+            # Distances are all that counts, so places on earth need no datum, and none that is near.
+            frame = layers.frame if part.local.any() else middle_frame(shapely.get_coordinates(part.geometry))
+            parts[key], count = _split_part(part, places, frame)
+            total = Split(total.edges + count.edges, total.nodes + count.nodes)
+    return (replace(layers, parts={**layers.parts, **parts}), total) if total.nodes else (layers, total)
+
+
+def _bent(part: Features, nodes: Container[str], shape_of: str | None) -> NDArray[np.intp]:
+    """Places of the edges between these nodes with more than two coordinates."""
+    line = shapely.get_type_id(part.geometry) == LINE
+    places = np.flatnonzero(line & (shapely.get_num_coordinates(part.geometry) > 2))
+    rows = ((k, part.properties[k]) for k in places.tolist())
+    edges = [(k, p) for k, p in rows if _is_edge(p) and p["source"] in nodes and p["target"] in nodes]
+    return np.array([k for k, p in edges if not _is_identified(p, shape_of)], np.intp)
+
+
+def _is_edge(properties: Properties) -> bool:
+    ends = (properties.get("source"), properties.get("target"))
+    return properties.get("kind") == "edge" and all(isinstance(end, str) for end in ends)
+
+
+def _is_identified(properties: Properties, name: str | None) -> bool:
+    known = properties.get(name) if name is not None else None
+    return isinstance(known, Mapping) and known.get("id") is not None
+
+
+@dataclass(slots=True)
+class _Course:
+    """An edge's vertices from the lower to the higher of its ends. at: [n, 2 or 3] as anchored. metres: [n, 2]."""
+
+    place: int
+    ends: tuple[str, str]
+    backward: bool
+    at: NDArray[np.float64]
+    metres: NDArray[np.float64]
+
+    @property
+    def key(self) -> bytes:
+        """Equal for both directions of one line."""
+        return (np.round(self.metres[1:-1], 3) + 0.0).tobytes()
+
+
+def _split_part(part: Features, places: NDArray[np.intp], frame: LocalFrame | None) -> tuple[Features, Split]:
+    courses = [course for course in _courses(part, places, frame) if len(course.at) > 2]
+    if not courses:
+        return part, Split()
+    lines: dict[tuple[str, str], dict[bytes, _Course]] = defaultdict(dict)
+    for course in courses:
+        lines[course.ends].setdefault(course.key, course)
+    wanted: list[str] = []
+    columns = _Columns()
+    first: dict[tuple[tuple[str, str], bytes], int] = {}
+    for ends, found in lines.items():
+        for key, course in found.items():
+            base = f"{ends[0]}~{ends[1]}"
+            if len(found) > 1:  # parallel edges: each line has a name of its own, whatever their order
+                base += f"~{hashlib.sha256(key).hexdigest()[:6]}"
+            first[ends, key] = len(wanted)
+            inner = course.at[1:-1]
+            wanted += [_numbered(base, n + 1) for n in range(len(inner))]
+            columns.geometry += list(shapely.points(inner))
+            columns.local += [bool(part.local[course.place])] * len(inner)
+    names = unique_ids(wanted, set(part.ids))
+    known = [p for found in lines.values() for course in found.values() for p in _known_nodes(part, course)]
+    columns.properties += [{"name": name, **p, "kind": "node"} for name, p in zip(names, known, strict=True)]
+    pieces: list[str] = []
+    for course in courses:
+        begin = first[course.ends, course.key]
+        between = names[begin : begin + len(course.at) - 2]
+        p = part.properties[course.place]
+        pieces += [_numbered(part.ids[course.place], n + 1) for n in range(len(between) + 1)]
+        columns.add_pieces(course, between, without_identity(p), local=bool(part.local[course.place]))
+    kept = np.ones(len(part), bool)
+    kept[[course.place for course in courses]] = False
+    rest = part.take(kept)
+    columns.ids = [*names, *unique_ids(pieces, {*rest.ids, *names})]
+    return columns.after(rest), Split(len(courses), len(names))
+
+
+def _known_nodes(part: Features, course: _Course) -> list[Properties]:
+    """What a file that was read said of the nodes at an edge's bends."""
+    count = len(course.at) - 2
+    known = part.properties[course.place].get(BENDS)
+    if isinstance(known, list) and len(known) == count and all(isinstance(p, Mapping) for p in known):
+        return known
+    return [{}] * count
+
+
+@dataclass(slots=True)
+class _Columns:
+    """Features that are being made, as columns."""
+
+    ids: list[str] = field(default_factory=list)
+    geometry: list[Any] = field(default_factory=list)
+    properties: list[Properties] = field(default_factory=list)
+    local: list[bool] = field(default_factory=list)
+
+    def add_pieces(self, course: _Course, between: Sequence[str], properties: Properties, *, local: bool) -> None:
+        """Add the straight edges of a course, in the edge's own direction."""
+        chain, at = [course.ends[0], *between, course.ends[1]], course.at
+        if course.backward:
+            chain, at = chain[::-1], at[::-1]
+        self.geometry += list(shapely.linestrings(np.stack([at[:-1], at[1:]], axis=1)))
+        self.properties += [{**properties, "source": a, "target": b} for a, b in pairwise(chain)]
+        self.local += [local] * (len(chain) - 1)
+
+    def after(self, rest: Features) -> Features:
+        """These features behind others, with the others' document."""
+        column: NDArray[np.object_] = np.empty(len(self.geometry), object)
+        column[:] = self.geometry
+        return Features(
+            (*rest.ids, *self.ids),
+            np.concatenate([rest.geometry, column]),
+            (*rest.properties, *self.properties),
+            np.concatenate([rest.local, np.array(self.local, bool)]),
+            rest.document,
+        )
+
+
+def _courses(part: Features, places: NDArray[np.intp], frame: LocalFrame | None) -> Iterator[_Course]:
+    """The bent edges from node to node, with the vertices that are bends."""
+    at_node = _node_positions(part, frame)
+    for k, metric in zip(places.tolist(), part.take(places).in_local(frame), strict=True):
+        p, shape = part.properties[k], part.geometry[k]
+        at = shapely.get_coordinates(shape, include_z=bool(shapely.has_z(shape)))
+        metres = shapely.get_coordinates(metric)
+        for end, name in ((0, p["source"]), (-1, p["target"])):
+            node = at_node.get(name)
+            if node is None or node[2] != part.local[k]:
+                continue
+            if np.hypot(*(node[1] - metres[end])) > TOLERANCE_METRES:  # the node is where the edge begins, or ends
+                where = len(at) if end else 0
+                at = np.insert(at, where, node[0][: at.shape[1]], axis=0)
+                metres = np.insert(metres, where, node[1], axis=0)
+        ends = (p["source"], p["target"])
+        backward = ends[0] > ends[1] or (ends[0] == ends[1] and metres.tolist() > metres[::-1].tolist())
+        if backward:
+            ends, at, metres = ends[::-1], at[::-1], metres[::-1]
+        bends = _bends(metres)
+        yield _Course(k, ends, backward, at[bends], metres[bends])
+
+
+def _node_positions(
+    part: Features, frame: LocalFrame | None
+) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64], bool]]:
+    """By id: [x, y, z] as anchored (z 0 where there is none), [x, y] in metres, and whether it is anchored locally."""
+    point = shapely.get_type_id(part.geometry) == POINT
+    rows = [k for k in np.flatnonzero(point).tolist() if part.properties[k].get("kind") == "node"]
+    nodes = part.take([k for k in rows if not part.geometry[k].is_empty])
+    at = np.nan_to_num(shapely.get_coordinates(nodes.geometry, include_z=True))
+    metres = shapely.get_coordinates(nodes.in_local(frame))
+    return {i: (at[n], metres[n], bool(nodes.local[n])) for n, i in enumerate(nodes.ids)}
+
+
+def _bends(metres: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Places of a line's ends and of the vertices that a line within the tolerance needs."""
+    line = shapely.simplify(shapely.linestrings(metres), TOLERANCE_METRES, preserve_topology=False)
+    wanted = shapely.get_coordinates(line)
+    if len(wanted) < 2:
+        return np.array([0, len(metres) - 1], np.intp)
+    found = [0]
+    for vertex in wanted[1:-1]:
+        found.append(found[-1] + 1 + int((metres[found[-1] + 1 :] == vertex).all(axis=1).argmax()))
+    return np.array([*found, len(metres) - 1], np.intp)
+
+
+def without_identity(properties: Properties) -> dict[str, Any]:
+    """An edge's properties without what identifies it in a file, and without its bends."""
+    return {
+        name: {word: v for word, v in value.items() if word not in IDENTITY} if isinstance(value, Mapping) else value
+        for name, value in properties.items()
+        if name != BENDS
+    }
+
+
+def _numbered(name: str, number: int) -> str:
+    """``name~number``, with a hash for the end of a name that is too long for an id."""
+    limit = MAX_ID - 40
+    if len(name) > limit:
+        name = f"{name[: limit - 17]}~{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+    return f"{name}~{number}"
+
+
+# --- on the way back ---
+
+
+def join(layers: Layers) -> Layers:
+    """Make the edges whole again that ``split`` has split, where nothing else uses the nodes at their bends."""
+    parts = {key: _join_part(part) for key, part in layers.vector("topology").items()}
+    changed = {key: part for key, part in parts.items() if part is not layers.parts[key]}
+    return replace(layers, parts={**layers.parts, **changed}) if changed else layers
+
+
+def _join_part(part: Features) -> Features:
+    chains: dict[str, dict[int, int]] = defaultdict(dict)
+    for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)):
+        found = _bend_of(i, p) if p.get("kind") == "node" else None
+        if found is not None:
+            chains[found[0]][found[1]] = k
+    if not chains:
+        return part
+    network = _Network(part)
+    for base, numbered in chains.items():
+        if set(numbered) == set(range(1, len(numbered) + 1)):
+            network.join(base, [numbered[n] for n in range(1, len(numbered) + 1)])
+    return network.joined()
+
+
+def _bend_of(i: str, p: Properties) -> tuple[str, int] | None:
+    """The base and the number in a bend's name; None for other nodes."""
+    for name in (i, p.get("name")):
+        found = NAMED.match(name) if isinstance(name, str) and "~" in name else None
+        if found is not None and "~" in found[1]:
+            return found[1], int(found[2])
+    return None
+
+
+class _Network:
+    """A network while edges are joined. touching: places of the edges at each node, by id."""
+
+    def __init__(self, part: Features) -> None:
+        self.part = part
+        self.nodes = {
+            i: k for k, (i, p) in enumerate(zip(part.ids, part.properties, strict=True)) if p.get("kind") == "node"
+        }
+        self.touching: dict[str, list[int]] = defaultdict(list)
+        for k, p in enumerate(part.properties):
+            if _is_edge(p):
+                for end in {p["source"], p["target"]}:
+                    self.touching[end].append(k)
+        self.gone: set[int] = set()
+        self.whole = _Columns()
+
+    def join(self, base: str, bends: Sequence[int]) -> None:
+        """Join the edges over a chain of bends, if they are exactly what ``split`` makes."""
+        part = self.part
+        ids = [part.ids[k] for k in bends]
+        near = {k for i in ids for k in self.touching[i]}
+        pairs = {(part.properties[k]["source"], part.properties[k]["target"]): k for k in near}
+        chain = self._chain(base, ids, pairs)
+        if chain is None or len(pairs) < len(near):
+            return
+        runs = []
+        for way in [chain] if chain == chain[::-1] else [chain, chain[::-1]]:
+            steps = [step for step in pairwise(way) if step in pairs]
+            if steps and len(steps) < len(way) - 1:
+                return
+            if steps:
+                runs.append((way, [pairs[step] for step in steps]))
+        if sum(len(run) for _, run in runs) < len(near) or not all(self._alike(run) for _, run in runs):
+            return
+        if any(part.local[k] != part.local[bends[0]] for _, run in runs for k in run):
+            return
+        self.gone |= {*bends, *near}
+        known = [{w: v for w, v in part.properties[k].items() if v and (w, v) != ("name", part.ids[k])} for k in bends]
+        for p in known:
+            del p["kind"]
+        for way, run in runs:
+            self._add(way, run, {BENDS: known} if any(known) else {})
+
+    def _chain(self, base: str, ids: Sequence[str], pairs: Mapping[tuple[str, str], int]) -> list[str] | None:
+        """The nodes from one end over the bends to the other end; None where these are not the ends."""
+        inner = set(ids)
+        firsts, lasts = (
+            {other for a, b in pairs for here, other in ((a, b), (b, a)) if here == end} - inner
+            for end in (ids[0], ids[-1])
+        )
+        for first in sorted(firsts):
+            for last in sorted(lasts):
+                for a in self._names(first):
+                    for b in self._names(last):
+                        if base == f"{a}~{b}" or re.fullmatch(re.escape(f"{a}~{b}~") + "[0-9a-f]{6}", base):
+                            return [first, *ids, last]
+        return None
+
+    def _names(self, i: str) -> list[str]:
+        k = self.nodes.get(i)
+        name = None if k is None else self.part.properties[k].get("name")
+        return [i, name] if isinstance(name, str) and name != i else [i]
+
+    def _alike(self, run: Sequence[int]) -> bool:
+        """Whether the pieces differ only in their ends: else somebody has edited them one by one."""
+        ends = {"source", "target"}
+        kept = [without_identity(self.part.properties[k]) for k in run]
+        first, *others = ({name: v for name, v in p.items() if name not in ends} for p in kept)
+        return all(other == first for other in others)
+
+    def _add(self, way: Sequence[str], run: Sequence[int], known: Properties) -> None:
+        part = self.part
+        numbers = [NAMED.match(part.ids[k]) for k in run]
+        names = {m[1] for n, m in enumerate(numbers) if m is not None and int(m[2]) == n + 1}
+        i = next(iter(names)) if len(names) == 1 and None not in numbers else f"{way[0]}_{way[-1]}"
+        steps = [shapely.get_coordinates(part.geometry[k], include_z=True) for k in run]
+        at = np.concatenate([steps[0][:1], *(step[-1:] for step in steps)])
+        line = shapely.linestrings(at[:, :2] if np.isnan(at[:, 2]).any() else at)
+        p = {**without_identity(part.properties[run[0]]), "source": way[0], "target": way[-1], **known}
+        self.whole.ids.append(i)
+        self.whole.geometry.append(line)
+        self.whole.properties.append(p)
+        self.whole.local.append(bool(part.local[run[0]]))
+
+    def joined(self) -> Features:
+        """The network with these edges."""
+        if not self.gone:
+            return self.part
+        rest = self.part.take([k for k in range(len(self.part)) if k not in self.gone])
+        self.whole.ids = unique_ids(self.whole.ids, set(rest.ids))
+        return self.whole.after(rest)

@@ -1,0 +1,117 @@
+"""A map of a network warns of edges that lead through obstacles, and closures find edges that get nodes at bends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+import yaml
+
+from app import formats
+from app.convert import make
+from app.model.closures import Closure, Closures
+from app.model.features import features
+from app.model.frame import GROUND
+from app.model.grid import FREE, OCCUPIED, OccupancyGrid
+from app.model.layers import MAP, NETWORK, Layers, Part, PartKey
+from tests.api.conftest import Api
+
+TOPOLOGY = PartKey("topology", GROUND, NETWORK)
+AROUND = [(0.5, 2.5), (0.5, 8.5), (9.5, 8.5), (9.5, 2.5)]
+"""From a to b around a wall on x = 5 that leaves y > 7 free."""
+
+
+def site(bend: bool, yaw: float = 0.0, **parts: Part) -> Layers:
+    """Two nodes on both sides of a wall, joined both ways, and one edge along the wall."""
+    turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+    at = [tuple(row) for row in (np.array(AROUND) @ turn).tolist()]
+    line = at if bend else [at[0], at[-1]]
+    up = [at[0], at[1]]
+    rows: list[tuple[str, Any, dict[str, Any]]] = [
+        ("a", shapely.Point(at[0]), {"kind": "node"}),
+        ("b", shapely.Point(at[-1]), {"kind": "node"}),
+        ("c", shapely.Point(at[1]), {"kind": "node"}),
+        ("a_b", shapely.LineString(line), {"kind": "edge", "source": "a", "target": "b"}),
+        ("b_a", shapely.LineString(line[::-1]), {"kind": "edge", "source": "b", "target": "a"}),
+        ("a_c", shapely.LineString(up), {"kind": "edge", "source": "a", "target": "c"}),
+    ]
+    network: dict[PartKey, Part] = {TOPOLOGY: features(rows, "local")}
+    return Layers({**network, **{PartKey(k, GROUND, MAP): p for k, p in parts.items()}})  # type: ignore[arg-type]
+
+
+def hall(yaw: float = 0.0) -> OccupancyGrid:
+    cells = np.full((20, 20), FREE, np.uint8)
+    cells[:14, 10] = OCCUPIED
+    return OccupancyGrid(cells, 0.5, (0.0, 0.0, yaw))
+
+
+def crossing(report: Mapping[str, Any]) -> list[str]:
+    return [w["problem"] for w in report["warnings"] if "cross" in w["problem"]]
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_straight_edges_through_a_wall_are_reported_and_bent_ones_go_around(yaw: float) -> None:
+    for name in ("tmap2", "geojson"):
+        known = formats.get_format(name)
+        through = make.from_layers(known, site(False, yaw, occupancy=hall(yaw)), {}, derived=False)
+        assert crossing(through.report) == [
+            "2 edges cross occupied cells of the occupancy grid 'map': a_b, b_a; a robot that follows the network "
+            "meets an obstacle there"
+        ]
+        assert crossing(make.from_layers(known, site(True, yaw, occupancy=hall(yaw)), {}, derived=False).report) == []
+
+
+def test_buildings_count_where_there_is_no_grid() -> None:
+    rows: list[tuple[str, Any, dict[str, Any]]] = [
+        ("house", shapely.box(4, 0, 6, 7), {"kind": "building"}),
+        ("roof", shapely.box(0, 4, 4, 6), {"kind": "building", "base": 3.0}),
+        ("home", shapely.box(0, 2, 1, 5), {"kind": "building"}),
+        ("park", shapely.box(0, 0, 9, 9), {"kind": "region"}),
+    ]
+    objects = features(rows, "local")
+    known = formats.get_format("tmap2")
+    (told,) = crossing(make.from_layers(known, site(False, objects=objects), {}, derived=False).report)
+    assert told.startswith("2 edges cross buildings or walls: a_b, b_a;") or told.startswith("2 edges cross")
+    assert crossing(make.from_layers(known, site(True, objects=objects), {}, derived=False).report) == []
+
+
+def test_nav2_drives_straight_along_its_own_bent_edges() -> None:
+    layers = site(True, occupancy=hall())
+    part = layers.vector("topology")[TOPOLOGY]
+    owned = tuple({**p, "nav2_route": {"id": k}} for k, p in enumerate(part.properties))
+    mine = Layers({**layers.parts, TOPOLOGY: features(zip(part.ids, part.geometry, owned, strict=True), "local")})
+    known = formats.get_format("nav2_route")
+    (told,) = crossing(make.from_layers(known, mine, {}, derived=False).report)
+    assert told.startswith("2 edges cross occupied cells")
+    assert crossing(make.from_layers(known, layers, {}, derived=False).report) == []
+
+
+def test_closures_by_id_and_area_close_all_pieces_of_a_bent_edge() -> None:
+    known = formats.get_format("tmap2")
+    until = "2030-01-01T00:00:00Z"
+    area = {"type": "Polygon", "coordinates": [[[4, 8], [6, 8], [6, 9], [4, 9], [4, 8]]]}
+    by_id = Closures((Closure("c", "blocked", GROUND, until, edge="a_b"),))
+    by_area = Closures((Closure("c", "blocked", GROUND, until, polygon=area, crs="local"),))
+    for closures, gone in ((by_id, {"a_b"}), (by_area, {"a_b", "b_a"})):
+        made = make.from_layers(known, site(True), {}, derived=False, closures=closures)
+        nodes = yaml.safe_load(made.files["network.tmap2.yaml"])["nodes"]
+        left = {e["edge_id"].partition("~")[0] for n in nodes for e in n["node"]["edges"]}
+        assert left == {"a_b", "b_a", "a_c"} - gone
+        (line,) = made.report["closures"]
+        assert set(line["edges"]) == gone, "the report names the edges of the version"
+
+
+def test_reports_of_stored_maps_name_edges_through_obstacles(api: Api, fresh: Any) -> None:
+    env = fresh()
+    api.post("environments", {"name": env})
+    layers = site(False, occupancy=hall())
+    for name in ("tmap2", "occupancy_grid"):
+        api.upload(env, make.from_layers(formats.get_format(name), layers, {}, derived=False).files)
+    report = api.get(f"environments/{env}/versions/latest/reports/tmap2").json()
+    assert len(crossing(report)) == 1
+    assert "a_b, b_a" in crossing(report)[0]
+    assert crossing(api.get(f"environments/{env}/versions/1/reports/tmap2").json()) == []
