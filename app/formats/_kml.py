@@ -6,7 +6,8 @@ metres.
 **What is kept of a drawing.** A placemark or overlay is one object. ``properties.kml`` keeps where it stood and what
 the canonical words cannot say:
 
-``document``  name of the file it came from; ``Features.document["kml"]["documents"][name]`` has the rest of that file
+``document``  key of the file it came from: ``Features.document["kml"]["documents"][key]`` has the rest of that file. The
+              key is made of that rest, not of the file's name, so that equal drawings are equal content
 ``place``     its number in that file
 ``xml``       the element as text, with slots instead of what the canonical words say: ``<?n?>`` the name, ``<?c?>`` a
               list of coordinates, ``<?d NAME?>`` a plain value of its ExtendedData, which stands in ``properties``
@@ -25,6 +26,7 @@ in common stands in the ExtendedData of their folder, marked by ``fleetmap``.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections import Counter
@@ -62,6 +64,9 @@ USUAL_PART: Mapping[str, str] = {"topology": NETWORK, "location": SITE, "zones":
 OWN_WORDS = frozenset({"layer", "level", "part", "id", "local", "geometry", "more", MARK})
 """Names in ExtendedData that place an item; a property of such a name travels in ``more``."""
 
+PLACE_WORDS = frozenset({"layer", "level", "part", "id"})
+"""Those whose values are names."""
+
 RESERVED = OWN_WORDS | {
     *("kind", "name", "source", "target", "orientation", "action", "speed_limit", "width", "value", "expires"),
     *("pose", "size", "datum", "drawn_from", "data", "documents", "tags", "properties", "style", "kml", "kmz", "osm"),
@@ -69,6 +74,9 @@ RESERVED = OWN_WORDS | {
     *("environment", "occupancy_grid", "octomap", "satellite", "pcd", "ply", "las", "prm", "ffr_network"),
 }
 """Property names that mean something to us: a drawing's own value of that name stays under ``properties.kml.data``."""
+
+DOCUMENT_KEY_DIGITS = 16
+"""Hexadecimal digits of a SHA-256 that serve as a drawing's key among the drawings of an environment."""
 
 COORDINATES, NAME, END = "<?c?>", "<?n?>", "<?end?>"
 SLOT = re.compile(r"<\?(c|n|d ([^?]*))\?>")
@@ -430,12 +438,12 @@ class _Item:
 
 
 def read_kml(
-    data: bytes, context: ReadContext, name: str, pictures: Mapping[str, bytes], entry: str | None = None
+    data: bytes, context: ReadContext, pictures: Mapping[str, bytes], entry: str | None = None
 ) -> tuple[Layers, set[str]]:
     """KML -> layers, and the names of the pictures that became grids.
 
-    name: of the file, under which its document is kept. pictures: what relative references may mean (KMZ). entry: the
-    name of this document inside its archive. Raises UnreadableFile with the line.
+    pictures: what relative references may mean (KMZ). entry: the name of this document inside its archive. Raises
+    UnreadableFile with the line.
     """
     root = _xml.parse(data, context.limits, remove_blank_text=True)
     if local_name(root) not in CONTAINERS | ITEMS:
@@ -444,7 +452,7 @@ def read_kml(
             [Problem(f"<{local_name(root)}> is not KML", line=root.sourceline)],
         )
     reader = _Reader(context, pictures)
-    reader.read(root, name, entry)
+    reader.read(root, entry)
     return reader.layers(), reader.used
 
 
@@ -463,16 +471,16 @@ class _Reader:
         self.documents: dict[str, dict[str, Any]] = {}
         self.credit: list[str] = []
 
-    def read(self, root: etree._Element, name: str, entry: str | None) -> None:
+    def read(self, root: etree._Element, entry: str | None) -> None:
         """A document, and those that we have put inside it."""
         marks = self._marks(root)
         for element, words in marks:
             if words.get(MARK) == "document" and element is not root and element.getparent() is not None:
-                inner = words.get("document") or name
+                level = words.get("level") or self.context.level
                 self._detach(element)
-                self._read_one(element, inner, words.get("entry"), words.get("level") or self.context.level, [])
+                self._read_one(element, words.get("document"), words.get("entry"), level, [])
         ours = [(e, w) for e, w in marks if w.get(MARK) != "document"]
-        self._read_one(root, name, entry, self.context.level, ours)
+        self._read_one(root, None, entry, self.context.level, ours)
 
     def _marks(self, root: etree._Element) -> list[tuple[etree._Element, dict[str, str]]]:
         """Containers that carry our mark, innermost last, with their words."""
@@ -480,7 +488,7 @@ class _Reader:
         for extended in root.iter("{*}ExtendedData"):
             parent = extended.getparent()
             if parent is not None and local_name(parent) in CONTAINERS:
-                words = {n: v.text or "" for n, v in _values(extended)}
+                words = _words(_values(extended), PLACE_WORDS | {"document", "entry"})
                 if MARK in words:
                     out.append((parent, words))
         return out
@@ -497,7 +505,7 @@ class _Reader:
     def _read_one(
         self,
         root: etree._Element,
-        name: str,
+        name: str | None,
         entry: str | None,
         level: str,
         ours: list[tuple[etree._Element, dict[str, str]]],
@@ -511,7 +519,7 @@ class _Reader:
         _check_places(items, parsed)
         mine, theirs = [], []
         for item in items:
-            words = dict(_spoken(item.data))
+            words = _words(item.data, PLACE_WORDS)
             if words.get("layer") in USUAL_PART:
                 mine.append((item, words))
             else:
@@ -681,11 +689,11 @@ class _Reader:
         root: etree._Element,
         items: list[_Item],
         parsed: Sequences,
-        name: str,
+        name: str | None,
         entry: str | None,
         level: str,
     ) -> None:
-        """Somebody's drawing: its items become objects, the rest of it the document."""
+        """Somebody's drawing: its items become objects, the rest of it the document. name: its key, if it has one."""
         geometry = _geometries(items, parsed)
         ids, titles = _identify(items, self.context)
         properties: list[dict[str, Any]] = []
@@ -694,7 +702,7 @@ class _Reader:
             title = titles[k]
             kind = "overlay" if local_name(item.element) in OVERLAYS else _KINDS[types[k]] or _mixed(geometry[k])
             own: dict[str, Any] = {"kind": kind}
-            kept: dict[str, Any] = {"document": name, "place": k}
+            kept: dict[str, Any] = {"place": k}
             if title is not None and title[1]:
                 own["name"] = title[1]
             for label, value in item.data:
@@ -705,9 +713,11 @@ class _Reader:
         self.columns.setdefault(level, []).append((ids, list(geometry), properties))
         documents = self.documents.setdefault(level, {})
         if self.context.whole:
-            documents[name] = {"xml": _keep_text(root, items, [t[0] if t else None for t in titles], properties)}
-            if entry is not None:
-                documents[name]["entry"] = entry
+            xml = _keep_text(root, items, [t[0] if t else None for t in titles], properties)
+            key = name or hashlib.sha256(f"{entry or ''}\0{xml}".encode()).hexdigest()[:DOCUMENT_KEY_DIGITS]
+            documents[key] = {"xml": xml} if entry is None else {"xml": xml, "entry": entry}
+            for own in properties:
+                own[FAMILY]["document"] = key
 
     # --- the result ---
 
@@ -871,8 +881,13 @@ def _values(extended: etree._Element) -> list[tuple[str, etree._Element]]:
     return list(out.items())
 
 
-def _spoken(data: Iterable[tuple[str, etree._Element]]) -> Iterator[tuple[str, str]]:
-    return ((name, value.text or "") for name, value in data)
+def _words(data: Iterable[tuple[str, etree._Element]], names: frozenset[str]) -> dict[str, str]:
+    """The values by name as texts; of these names as they were before ``spell`` quoted what looks like a number."""
+    words = {name: value.text or "" for name, value in data}
+    for name in names & words.keys():
+        value = unspell(words[name])
+        words[name] = value if isinstance(value, str) else words[name]
+    return words
 
 
 def _plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Element]]] | None:

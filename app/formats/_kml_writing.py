@@ -465,6 +465,7 @@ _ITEMS = re.compile(r"<\?items ([0-9]+)\?>")
 _PREFIX = re.compile(r"[<\s]/?([\w.-]+):[\w.-]+(?=[\s=>/])")
 _DECLARED = re.compile(r"xmlns:([\w.-]+)=")
 _ROOT = re.compile(r"<((?:[\w.-]+:)?([\w.-]+))((?:\s[^>]*?)?)(/?)>")
+_TITLE = re.compile(r"<(?:[\w.-]+:)?name>([^<]*)</")
 _XMLNS = re.compile(r"""\sxmlns(?::[\w.-]+)?="[^"]*\"""")
 
 
@@ -736,7 +737,8 @@ def _wrapped(document: _Document, xml: str) -> str:
     if root and root[2] == "kml":
         xml = "" if root[4] else xml[root.end() : xml.rindex("<")]
     default = "" if ' xmlns="' in declarations else f' xmlns="{KML}"'
-    shown = escape(document.name.rpartition("/")[2])
+    title = _TITLE.search(xml)
+    shown = title[1] if title and title[1].strip() else "drawing"
     return (
         f'<Document{default}{declarations}><name>{shown}</name><ExtendedData xmlns="{KML}">{words}</ExtendedData>'
         f"{xml}</Document>\n"

@@ -28,7 +28,7 @@ def detect(name: str, data: bytes) -> bool:
 
 def read(files: Files, context: ReadContext) -> Layers:
     """The objects of a drawing, or the layers that we once wrote into it."""
-    layers, _ = read_kml(files[context.main], context, context.main, {})
+    layers, _ = read_kml(files[context.main], context, {})
     return layers
 
 

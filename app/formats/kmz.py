@@ -36,7 +36,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     entries = archive.unpack(files[context.main], context.limits)
     main = first_kml(entries)
     others = {name: body for name, body in entries.items() if name != main}
-    layers, used = read_kml(entries[main], context, context.main, others, main)
+    layers, used = read_kml(entries[main], context, others, main)
     kept = {name: body for name, body in others.items() if name not in used}
     parts: dict[PartKey, Part] = dict(layers.parts)
     if kept and context.wants("resources"):

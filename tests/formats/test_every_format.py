@@ -13,7 +13,9 @@ from app.convert import offline
 from app.errors import BadUpload, CannotConvert, Invalid, MissingLayer
 from app.formats import Limits
 from app.model.frame import Datum
-from app.model.layers import LAYERS, Layers
+from app.model.layers import LAYERS, Layers, PartKey
+from app.store import parts
+from app.store.tree import Draft
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 HERE = Datum(53.2686, -0.5245, heading=12.5)
@@ -123,3 +125,23 @@ def test_a_format_is_not_made_from_nothing(name: str) -> None:
     with pytest.raises((MissingLayer, CannotConvert)) as caught:
         chain(known, Stock(frozenset(), False), known.write_options())
     assert "supply" in caught.value.detail or "needs" in caught.value.detail
+
+
+FILE_NAME_IS_CONTENT = {"gazebo": "worlds are chosen by their file", "rmf_nav_graph": "a graph's file has its number"}
+"""Formats whose parts keep the name of a file; formats of grids, voxels and images name their part by it instead."""
+
+
+@pytest.mark.parametrize(("name", "files"), [case for case in CASES if case.values[0] not in FILE_NAME_IS_CONTENT])
+def test_equal_files_under_other_names_are_equal_content(name: str, files: dict[str, bytes]) -> None:
+    def hashes(named: dict[str, bytes]) -> dict[PartKey, bytes]:
+        made = {k: parts.compose(Draft(lambda _: {}), p, None, "") for k, p in layers_of(name, named).parts.items()}
+        return {key: part.hash for key, part in made.items() if part is not None}
+
+    before = hashes(files)
+    assert hashes({f"another folder/{n}": data for n, data in files.items()}) == before
+    for group in formats.group(files, name)[0]:
+        folder, slash, base = group.main.rpartition("/")
+        renamed = f"{folder}{slash}other{base[base.index('.') :]}"
+        if len(files) == 1:
+            after = hashes({renamed: files[group.main]})
+            assert after == before or after.keys() != before.keys()
