@@ -6,8 +6,8 @@ metres.
 **What is kept of a drawing.** A placemark or overlay is one object. ``properties.kml`` keeps where it stood and what
 the canonical words cannot say:
 
-``document``  key of the file it came from: ``Features.document["kml"]["documents"][key]`` has the rest of that file. The
-              key is made of that rest, not of the file's name, so that equal drawings are equal content
+``document``  key of the file it came from: ``Features.document["kml"]["documents"][key]`` has the rest of that file, of
+              which the key is made, not of the file's name: equal drawings are equal content
 ``place``     its number in that file
 ``xml``       the element as text, with slots instead of what the canonical words say: ``<?n?>`` the name, ``<?c?>`` a
               list of coordinates, ``<?d NAME?>`` a plain value of its ExtendedData, which stands in ``properties``
