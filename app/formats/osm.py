@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext, _osm_rules, _osm_text, register
-from app.formats._osm import INT64, Attributes, Data, Tags, Way, is_pbf, parse, unpack
+from app.formats._osm import INT64, Data, Tags, Way, is_pbf, parse, unpack
 from app.formats._osm_text import NOTHING, Node, as_texts, attribute_text, element_id, integers, plain
 from app.formats._text import DEGREES, numbers
 from app.model import osm_tags
