@@ -18,8 +18,8 @@ import shapely
 from numpy.typing import NDArray
 
 from app import formats
-from app.errors import BadUpload, Invalid, Problem, UnreadableFile
-from app.formats import Files, Format, Group, Limits, ReadContext, _archive, _json, _shell, _xml, _yaml
+from app.errors import BadUpload, FleetMapError, Invalid, Problem, UnreadableFile
+from app.formats import Files, Format, Group, Limits, ReadContext, _archive, _content, _json, _shell, _xml, _yaml
 from app.model import network
 from app.model.features import Features, concatenate, from_columns, unique_ids
 from app.model.frame import GROUND, Datum, Level
@@ -162,12 +162,16 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
         raise Invalid(f"layer must be one of {', '.join(DRAWN_LAYERS)}, got {hints.layer!r}")
     if not files:
         raise Invalid("the upload has no file: send at least one as form field 'files'")
+    bundle = Bundle(files={name: Use() for name in files}, inner=inner)
+    if (content := _content.find(files)) is not None:
+        if _take_content(files, content, hints, limits, bundle):
+            return bundle
+        files = {name: data for name, data in files.items() if name not in _content.owned(files, content)}
     if hints.format is not None and formats.get_format(hints.format).holds:
         # A folder of other formats' maps is what any upload may be: each file is found out by its content.
         held = [n for n in files if template_folder(n) or PurePosixPath(n).name in VARIABLES_FILES]
         if held:
             hints = dataclasses.replace(hints, format=None)
-    bundle = Bundle(files={name: Use() for name in files}, inner=inner)
     variables = _read_variables(files, bundle)
     others = {n: d for n, d in files.items() if n not in variables}
     groups, rest = _group(others, hints) if any(others.values()) or not variables else ([], sorted(others))
@@ -204,6 +208,32 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
         raise UnreadableFile(detail, problems)
     _choose_datum(bundle, known)
     return bundle
+
+
+def _take_content(files: Files, main: str, hints: Hints, limits: Limits, bundle: Bundle) -> bool:
+    """Take the layers that a package carries exactly; False where its maps count, with the reason as a warning."""
+    if dataclasses.replace(hints, format=None) != Hints() or hints.format not in (None, "environment"):
+        found: _content.Content | str = "the upload says how its maps are to be read"
+    else:
+        try:
+            with _blamed_on(main):
+                found = _content.read(files, main, limits)
+        except BadUpload:
+            raise
+        except (*formats.BAD_INPUT, FleetMapError, shapely.errors.ShapelyError) as error:
+            reason = f"what is stored beside the maps is damaged: {formats.explain(error)[1]}; remove its folder"
+            raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main)]) from error
+    if isinstance(found, str):
+        for name in _content.owned(files, main):
+            bundle.files[name] = Use("environment", used=False)
+        bundle.warnings.append(Problem(f"not used, the maps of the package count: {found}", main))
+        return False
+    bundle.files = {name: Use("environment", used=True) for name in files}
+    bundle.parts, bundle.datum, bundle.levels = dict(found.layers.parts), found.layers.datum, found.layers.levels
+    bundle.origin = dict.fromkeys(bundle.parts, ((main,), "environment"))
+    folder = main.rpartition("/")[0]
+    bundle.notices = {f"{folder}/{number}": text for number, text in enumerate(found.attribution)}
+    return True
 
 
 def _unknown(name: str, data: bytes, limits: Limits) -> Problem:

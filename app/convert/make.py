@@ -169,7 +169,7 @@ def _written(known: Format, made: Layers, options: Any, source: _Source, notes: 
     """One map of what was derived and what was there."""
     layers, way, entries, origin = source.layers, source.way, source.entries, source.origin
     credit, templates, closures = source.credit, source.templates, source.closures
-    context = WriteContext(options=options)
+    context = WriteContext(options=options, stored=closures is None or not closures.items)
     inner: list[dict[str, Any]] = []
     inner_closures: list[list[dict[str, Any]]] = []
     if known.holds:

@@ -53,7 +53,9 @@ class Stock:
     pinned: Mapping[Layer, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
 
     def seen_by(self, known: Format) -> Stock:
-        """The same with the blank parts that came from this format."""
+        """The same with the blank parts that came from this format; a folder of maps holds all of them."""
+        if known.holds:
+            return replace(self, keys=self.keys | self.blank, blank=frozenset())
         own = {k for k in self.blank if k.name == known.family or (k.layer == "voxels" and k.layer in known.carries)}
         return replace(self, keys=self.keys | own, blank=frozenset()) if own else self
 

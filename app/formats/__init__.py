@@ -109,13 +109,15 @@ class WriteContext:
     title: the environment's name, for formats with a place for one. options: the format's own write options.
     attribution: licences and credits of the sources, for formats with a place for them. make: for formats that hold
     others: a map of the named format from these layers, with these of its options, its missing layers derived or not;
-    it raises NotFound for a format that is not there, and what planning and writing raise.
+    it raises NotFound for a format that is not there, and what planning and writing raise. stored: whether the layers
+    are what is stored, and no closure in force has changed them.
     """
 
     title: str = "map"
     options: Any = None
     attribution: tuple[str, ...] = ()
     make: Callable[[str, Layers, Mapping[str, Any], bool], Inner] | None = None
+    stored: bool = False
     dropped: list[dict[str, Any]] = field(default_factory=list)
     template: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[Problem] = field(default_factory=list)
