@@ -394,6 +394,8 @@ def _key(
         "levels": [[level.name, level.elevation] for level in version.levels],
     }
     ingredients |= applied_closures.ingredients(version, known, way.keys)
+    if known.titled or known.holds:
+        ingredients["title"] = version.environment
     if spread is not None:
         ingredients["spread"] = dataclasses.asdict(spread)
     if known.holds:  # its bytes are those of other writers and, where they lack a layer, of derivations

@@ -102,6 +102,10 @@ class Inner:
     warnings: tuple[Problem, ...] = ()
 
 
+UNTITLED = "map"
+"""What a map is called that is made for no environment."""
+
+
 @dataclass(slots=True)
 class WriteContext:
     """What a writer is told, and where it declares what it lost or made up (loss is data).
@@ -113,7 +117,7 @@ class WriteContext:
     are what is stored, and no closure in force has changed them.
     """
 
-    title: str = "map"
+    title: str = UNTITLED
     options: Any = None
     attribution: tuple[str, ...] = ()
     make: Callable[[str, Layers, Mapping[str, Any], bool], Inner] | None = None
@@ -195,7 +199,8 @@ class Format:
     picture without a place); empty for other files. completing: the read options that say it.
     looks_at: files of other maps of the upload that it looks into. parts: the options that select a stored part, for
     formats whose files hold one part each. holds: it is a folder of other formats' maps. marks_blocked: it can
-    express a blocked edge, so that such an edge stays in it; other formats leave it out.
+    express a blocked edge, so that such an edge stays in it; other formats leave it out. titled: it names the
+    environment (``WriteContext.title``), so its bytes depend on that name.
     """
 
     name: str
@@ -229,6 +234,7 @@ class Format:
     lacking: Callable[[str, bytes], str] = lambda name, data: ""
     completing: frozenset[str] = frozenset()
     marks_blocked: bool = False
+    titled: bool = False
 
 
 @dataclass(frozen=True, slots=True)

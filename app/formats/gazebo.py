@@ -749,6 +749,7 @@ register(
             also=frozenset({"resources", "occupancy"}),
         ),
         family=NAME,
+        titled=True,
         rank=10,
     )
 )

@@ -55,6 +55,7 @@ register(
         marks_blocked=True,
         drawing=True,
         outlines=True,
+        titled=True,
         rank=10,
         extensions=(".kml",),
     )

@@ -85,6 +85,7 @@ register(
         family=FAMILY,
         marks_blocked=True,
         drawing=True,
+        titled=True,
         rank=11,
         extensions=(".kmz",),
     )

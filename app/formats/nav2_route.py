@@ -563,6 +563,7 @@ register(
         family=NAME,
         check=_nav2_route_rules.check,
         lacks=lacks,
+        titled=True,
         rank=36,
         extensions=(".geojson", ".json"),
     )

@@ -1305,6 +1305,7 @@ register(
         needs=Needs(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
         companions=companions,
         family=NAME,
+        titled=True,
         rank=40,
         write_options=_rmf.WriteOptions,
         extensions=(".building.yaml", ".yaml", ".yml"),

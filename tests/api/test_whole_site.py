@@ -122,6 +122,10 @@ def test_an_environment_uploaded_again_as_its_package_has_the_same_root(
         before = api.get(f"environments/{name}/versions/latest").json()
         assert made["root"] == before["root"]
         assert made["warnings"] == []
+        for env in (name, copy):
+            network = yaml.safe_load(api.get(f"/maps/{env}/tmap2/network.tmap2.yaml").content)
+            said = {network[key] for key in ("name", "metric_map", "pointset")}
+            assert said == {env} if name != real else "riseholme" in network["name"], "an uploaded one keeps its own"
 
 
 def test_manifest_lists_drawn_masks_of_polytunnels(api: Api, polytunnels: str) -> None:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
+from typing import Any
 
 import pytest
+import shapely
 
 from app import formats
 from app.bundle import Hints, Known, read, unpack
 from app.convert import offline
+from app.convert.make import from_layers
 from app.errors import BadUpload, CannotConvert, Invalid, MissingLayer
 from app.formats import Limits
+from app.model.features import features
 from app.model.frame import Datum
 from app.model.layers import LAYERS, Layers, PartKey
 from app.store import parts
@@ -145,3 +149,19 @@ def test_equal_files_under_other_names_are_equal_content(name: str, files: dict[
         if len(files) == 1:
             after = hashes({renamed: files[group.main]})
             assert after == before or after.keys() != before.keys()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_format_that_names_the_environment_says_so(name: str) -> None:
+    """Else a map of one environment would be served for another one of equal content."""
+    known = formats.get_format(name)
+    rows: list[Any] = [("a", shapely.Point(0, 0), {"kind": "node"}), ("b", shapely.Point(9, 0), {"kind": "node"})]
+    rows.append(("e", shapely.LineString([(0, 0), (9, 0)]), {"kind": "edge", "source": "a", "target": "b"}))
+    wall = ("wall", shapely.box(3, 3, 4, 4), {"kind": "wall", "height": 2.0})
+    layers = Layers({PartKey("topology", name="network"): features(rows, "local"),
+                     PartKey("objects", name="generated"): features([wall], "local")}, HERE)  # fmt: skip
+    try:
+        one, two = (from_layers(known, layers, {}, derived=True, title=title).files for title in ("one", "two"))
+    except CannotConvert:
+        pytest.skip("it needs other layers, and none of them has a name")
+    assert (one != two) == (known.titled or known.holds)
