@@ -47,6 +47,7 @@ from app.model.features import MAX_ID, NO_GEOMETRY, Features, unique_ids
 from app.model.frame import MAX_METRES, Datum, Level
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
+from app.model.imagery import Picture
 from app.model.layers import MAP, NETWORK, SITE, VECTOR_LAYERS, ZONES, Layers, Part, PartKey
 
 FAMILY = "kml"
@@ -60,7 +61,9 @@ GEOMETRIES = SIMPLE | {"MultiGeometry", "Model", "Track", "MultiTrack"}
 
 MARK = "fleetmap"
 STYLE = "fleetmap-"
-USUAL_PART: Mapping[str, str] = {"topology": NETWORK, "location": SITE, "zones": ZONES, "occupancy": MAP, "objects": ""}
+USUAL_PART: Mapping[str, str] = {
+    **{"topology": NETWORK, "location": SITE, "zones": ZONES, "occupancy": MAP, "objects": "", "imagery": "satellite"}
+}
 OWN_WORDS = frozenset({"layer", "level", "part", "id", "local", "geometry", "more", MARK})
 """Names in ExtendedData that place an item; a property of such a name travels in ``more``."""
 
@@ -466,7 +469,7 @@ class _Reader:
         self.datum: Datum | None = None
         self.levels: dict[str, float] = {}
         self.own: dict[PartKey, _Own] = {}
-        self.grids: dict[PartKey, OccupancyGrid] = {}
+        self.rasters: dict[PartKey, OccupancyGrid | Picture] = {}
         self.columns: dict[str, list[tuple[list[str], list[Any], list[dict[str, Any]]]]] = {}
         self.documents: dict[str, dict[str, Any]] = {}
         self.credit: list[str] = []
@@ -546,8 +549,8 @@ class _Reader:
                 parent.remove(element)
             layer = words["layer"]
             title = child_text(element, "name")
-            if layer == "occupancy":
-                self._take_grid(element, words, title)
+            if layer in ("occupancy", "imagery"):
+                self._take_raster(element, words, title)
                 continue
             properties: dict[str, Any] = {"name": title} if title else {}
             for label, text in words.items():
@@ -575,39 +578,57 @@ class _Reader:
             raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)])
         self.datum = Datum(**numbers)
 
-    def _take_grid(self, element: etree._Element, words: Mapping[str, str], title: str) -> None:
-        """A grid whose picture travels with the drawing (KMZ): the picture's palette index is the cell."""
+    def _take_raster(self, element: etree._Element, words: Mapping[str, str], title: str) -> None:
+        """A grid or a picture of ours, where its image travels with the drawing."""
         icon = child(element, "Icon")
         href = "" if icon is None else child_text(icon, "href")
-        label = words.get("part") or title or MAP
-        picture = self.pictures.get(href)
-        if picture is None:
+        layer = words["layer"]
+        label = words.get("part") or title or USUAL_PART[layer]
+        what = "grid" if layer == "occupancy" else "picture"
+        data = self.pictures.get(href)
+        if data is None:
             self.context.warn(
-                "its picture is not here (it travels in KMZ only), so the grid is left out",
+                f"its image {href!r} is not in the upload, so the {what} is left out: upload the KMZ, or both files",
                 line=element.sourceline,
                 where=label,
             )
             return
         said = {n: unspell(t) for n, t in words.items()}
-        image = _image.read_image(picture, self.context.limits)
+        self.used.add(href)
+        read = self._grid if layer == "occupancy" else self._picture
+        try:
+            self.rasters[self._key(words, layer)] = read(data, href, said)
+        except (KeyError, TypeError) as error:
+            reason = f"the {what} {label} lacks what places it: {error}"
+            raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)]) from error
+
+    def _grid(self, data: bytes, href: str, said: Mapping[str, Any]) -> OccupancyGrid:
+        """A grid: the image's palette index is the cell."""
+        image = _image.read_image(data, self.context.limits)
         if image.mode != "P":
             raise UnreadableFile(f"{href} is no longer the picture of a grid: its colours have changed")
-        self.used.add(href)
-        origin = said.get("origin")
-        if not isinstance(origin, list) or "resolution" not in said:
-            reason = f"grid {label} has no resolution and origin"
-            raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)])
         properties = said.get("properties")
-        self.grids[self._key(words, "occupancy")] = OccupancyGrid(
+        return OccupancyGrid(
             np.ascontiguousarray(np.asarray(image, np.uint8)[::-1]),
             float(said["resolution"]),
-            tuple(float(v) for v in origin),  # type: ignore[arg-type]
+            tuple(float(v) for v in said["origin"]),  # type: ignore[arg-type]
             said.get("mode", "trinary"),
             float(said.get("occupied_thresh", 0.65)),
             float(said.get("free_thresh", 0.196)),
             bool(said.get("negate", False)),
             properties if isinstance(properties, dict) else {},
         )
+
+    def _picture(self, data: bytes, href: str, said: Mapping[str, Any]) -> Picture:
+        """A picture: its pixels, and the exact place that its overlay has in our words."""
+        image = _image.read_image(data, self.context.limits)
+        if image.mode not in ("L", "LA", "RGB", "RGBA"):
+            raise UnreadableFile(f"{href} is no longer the picture that was written: its colours have changed")
+        pixels = np.asarray(image, np.uint8).reshape(image.height, image.width, -1)
+        a, b, c, d, e, f = (float(v) for v in said["transform"])
+        properties = said.get("properties")
+        own = properties if isinstance(properties, dict) else {}
+        return Picture(np.ascontiguousarray(pixels), (a, b, c, d, e, f), str(said["crs"]), own)
 
     def _remove_ours(self, root: etree._Element, ours: list[tuple[etree._Element, dict[str, str]]]) -> bool:
         """Take out our folders and styles; True where nothing of anybody else is left in the file."""
@@ -722,7 +743,7 @@ class _Reader:
     # --- the result ---
 
     def layers(self) -> Layers:
-        parts: dict[PartKey, Part] = dict(self.grids)
+        parts: dict[PartKey, Part] = dict(self.rasters)
         for level, columns in self.columns.items():
             ids = unique_ids(i for c in columns for i in c[0])
             shapes = [g for c in columns for g in c[1]]
