@@ -22,7 +22,7 @@ from app.errors import BadUpload, FleetMapError, Invalid, Problem, UnreadableFil
 from app.formats import Files, Format, Group, Limits, ReadContext, _archive, _content, _json, _shell, _xml, _yaml
 from app.model import network
 from app.model.features import Features, concatenate, from_columns, unique_ids
-from app.model.frame import GROUND, Datum, Level
+from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum, Level
 from app.model.geodesy import local_frame
 from app.model.imagery import Picture
 from app.model.layers import NETWORK, SITE, ZONES, Layer, Layers, Part, PartKey, Resources, is_empty, join_levels
@@ -281,7 +281,7 @@ def corner(parts: Mapping[PartKey, Part]) -> Datum | None:
     west, south, east = boxes[:, 0].min(), boxes[:, 1].min(), boxes[:, 2].max()
     if east - west > 180.0:  # the data lies on both sides of the antimeridian: west is the smallest eastern longitude
         west = boxes[boxes[:, 0] > 0.0, 0].min()
-    return Datum(float(np.clip(south, -85.0, 85.0)), float(west))
+    return Datum(float(np.clip(south, -MAX_DATUM_LATITUDE, MAX_DATUM_LATITUDE)), float(west))
 
 
 def _notice(name: str, data: bytes) -> str | None:
@@ -626,3 +626,9 @@ def _choose_datum(bundle: Bundle, known: Known) -> None:
             f"{chosen.longitude!r}, is taken; upload a datum.yaml or PATCH the environment to set another"
         )
         bundle.warnings.append(Problem(reason))
+        if abs(chosen.latitude) == MAX_DATUM_LATITUDE:
+            reason = (
+                f"the data begins at or beyond {chosen.latitude:g} degrees of latitude, and no datum lies nearer to a "
+                "pole: metres far from the datum are not exact; use local metres there"
+            )
+            bundle.warnings.append(Problem(reason))
