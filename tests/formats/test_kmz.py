@@ -16,6 +16,7 @@ import pyproj
 import pytest
 from lxml import etree
 
+from app.convert import offline
 from app.errors import BadUpload, TooLarge, UnreadableFile
 from app.formats import (
     Group,
@@ -301,3 +302,12 @@ def test_values_that_an_overlay_cannot_show_are_told() -> None:
     made = load(data).parts[PartKey("imagery", name="dem")]
     assert isinstance(made, Picture)
     assert (made.pixels.shape, made.transform) == ((4, 6, 2), EARTH["transform"])
+
+
+def test_images_beside_a_kml_are_those_of_the_files() -> None:
+    room = SAMPLES.parent / "occupancy_grid" / "room"
+    files = {p.name: p.read_bytes() for p in room.iterdir()}
+    kmz = _archive.unpack(offline(files, "kmz", datum=DATUM).files["map.kmz"], Limits())
+    made = offline(files, "kml", datum=DATUM, options={"pictures": "true"}).files
+    assert made["room.png"] == kmz["room.png"]
+    assert list(offline(files, "kml", datum=DATUM).files) == ["map.kml"]
