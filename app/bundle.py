@@ -101,6 +101,7 @@ class Bundle:
     warnings: list[Problem] = field(default_factory=list)
     fence: shapely.Polygon | None = None
     notices: dict[str, str] = field(default_factory=dict)
+    credits: Mapping[PartKey, tuple[str, ...]] = field(default_factory=dict)
     inner: bool = False
 
     def credit(self, key: PartKey) -> tuple[str, ...]:
@@ -109,6 +110,7 @@ class Bundle:
         said = part.document.get("attribution", ()) if isinstance(part, Features) else ()
         said = part.attribution if isinstance(part, Picture) else said
         texts = [text for text in said if isinstance(text, str)] if isinstance(said, list | tuple) else []
+        texts += self.credits.get(key, ())
         names, _ = self.origin.get(key, ((), ""))
         for notice, text in sorted(self.notices.items()):
             folder = notice.rpartition("/")[0]
@@ -231,8 +233,7 @@ def _take_content(files: Files, main: str, hints: Hints, limits: Limits, bundle:
     bundle.files = {name: Use("environment", used=True) for name in files}
     bundle.parts, bundle.datum, bundle.levels = dict(found.layers.parts), found.layers.datum, found.layers.levels
     bundle.origin = dict.fromkeys(bundle.parts, ((main,), "environment"))
-    folder = main.rpartition("/")[0]
-    bundle.notices = {f"{folder}/{number}": text for number, text in enumerate(found.attribution)}
+    bundle.credits = found.credits
     return True
 
 

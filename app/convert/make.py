@@ -174,7 +174,8 @@ def _written(known: Format, made: Layers, options: Any, source: _Source, notes: 
     """One map of what was derived and what was there."""
     layers, way, entries, origin = source.layers, source.way, source.entries, source.origin
     credit, closures = source.credit, source.closures
-    context = WriteContext(source.title, options, stored=closures is None or not closures.items)
+    noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
+    context = WriteContext(source.title, options, stored=None if closures is not None and closures.items else noted)
     inner: list[dict[str, Any]] = []
     inner_closures: list[list[dict[str, Any]]] = []
     if known.holds:
@@ -188,7 +189,6 @@ def _written(known: Format, made: Layers, options: Any, source: _Source, notes: 
         if closed.emptied and _lacks_edges(known, applied):
             applied, closed = applied_closures.close(known, used, closures, drawn, mark=True)
         used = applied
-    noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
     lines = _told(used, layers, way, entries or {}, origin or {}, noted)
     context.attribution = tuple(sorted(credits_of(lines)))  # whichever part came first: equal content, equal bytes
     files = formats.write(known, used, context)

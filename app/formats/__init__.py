@@ -113,15 +113,15 @@ class WriteContext:
     title: the environment's name, for formats with a place for one. options: the format's own write options.
     attribution: licences and credits of the sources, for formats with a place for them. make: for formats that hold
     others: a map of the named format from these layers, with these of its options, its missing layers derived or not;
-    it raises NotFound for a format that is not there, and what planning and writing raise. stored: whether the layers
-    are what is stored, and no closure in force has changed them.
+    it raises NotFound for a format that is not there, and what planning and writing raise. stored: the
+    licences and credits of each part, where the layers are what is stored; None where a closure has changed them.
     """
 
     title: str = UNTITLED
     options: Any = None
     attribution: tuple[str, ...] = ()
     make: Callable[[str, Layers, Mapping[str, Any], bool], Inner] | None = None
-    stored: bool = False
+    stored: Mapping[PartKey, Sequence[str]] | None = None
     dropped: list[dict[str, Any]] = field(default_factory=list)
     template: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[Problem] = field(default_factory=list)

@@ -4,8 +4,8 @@ Maps of other formats round, fill in and leave out; so a package carries in ``fl
 and the SHA-256 of each of its maps. While these are as they were written, reading the package gives back the very
 layers; once a map was edited, added or removed, the maps alone count.
 
-content.json: ``version``; ``maps``, path -> SHA-256; ``datum``; ``levels``, [name, elevation]; ``attribution``, texts;
-``parts``, each with ``layer``, ``level``, ``name`` and the fields of its type. Geometry is hexadecimal WKB. An array is
+content.json: ``version``; ``maps``, path -> SHA-256; ``datum``; ``levels``, [name, elevation]; ``parts``, each with
+``layer``, ``level``, ``name``, ``attribution`` and the fields of its type. Geometry is hexadecimal WKB. An array is
 {``file``, ``type``, ``shape``}: little-endian numbers in a file of their own; a resource is the name of its file. Paths
 are relative to the folder ``config``; a resource that is also one of the maps is not stored twice.
 """
@@ -38,21 +38,24 @@ _TYPES = frozenset({"|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """What a package says of its environment. attribution: licences and credits of all parts."""
+    """What a package says of its environment. credits: licences and credits by part."""
 
     layers: Layers
-    attribution: tuple[str, ...]
+    credits: Mapping[PartKey, tuple[str, ...]]
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
 
 
-def pack(layers: Layers, maps: Files, attribution: Sequence[str]) -> dict[str, bytes]:
-    """The content's files by path. maps: the files of the package, by path."""
+def pack(layers: Layers, maps: Files, credits: Mapping[PartKey, Sequence[str]]) -> dict[str, bytes]:
+    """The content's files by path. maps: the files of the package, by path. credits: by part."""
     hashes = {path: hashlib.sha256(data).hexdigest() for path, data in sorted(maps.items())}
     blobs = _Blobs({digest: path for path, digest in reversed(hashes.items())})
     parts = [
-        {"layer": key.layer, "level": key.level, "name": key.name, **_encoded(part, blobs)}
+        {
+            **{"layer": key.layer, "level": key.level, "name": key.name, "attribution": list(credits.get(key, ()))},
+            **_encoded(part, blobs),
+        }
         for key, part in sorted(layers.parts.items(), key=lambda item: item[0])
     ]
     content = {
@@ -60,10 +63,9 @@ def pack(layers: Layers, maps: Files, attribution: Sequence[str]) -> dict[str, b
         "maps": hashes,
         "datum": None if layers.datum is None else layers.datum.as_dict(),
         "levels": [[level.name, level.elevation] for level in layers.levels],
-        "attribution": list(attribution),
         "parts": parts,
     }
-    return {MAIN: orjson.dumps(content, option=orjson.OPT_SORT_KEYS), **blobs.files}
+    return {MAIN: orjson.dumps(content), **blobs.files}
 
 
 @dataclass(slots=True)
@@ -125,12 +127,14 @@ def read(files: Files, main: str, limits: Limits) -> Content | str:
         if hashlib.sha256(files[name]).hexdigest() != maps[name]:
             return f"{name} was edited"
     parts: dict[PartKey, Part] = {}
+    stated: dict[PartKey, tuple[str, ...]] = {}
     for row in top["parts"]:
         key = PartKey(row.pop("layer"), row.pop("level"), row.pop("name"))
+        stated[key] = tuple(map(str, row.pop("attribution")))
         parts[key] = _decoded(key, row, {n.removeprefix(folder): data for n, data in files.items()}, limits)
     datum = None if top["datum"] is None else Datum(**top["datum"])
     levels = tuple(Level(str(name), float(elevation)) for name, elevation in top["levels"])
-    return Content(Layers(parts, datum, levels), tuple(map(str, top["attribution"])))
+    return Content(Layers(parts, datum, levels), stated)
 
 
 def _decoded(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes], limits: Limits) -> Part:

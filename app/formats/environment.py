@@ -117,8 +117,8 @@ class _Writer:
             raise MissingLayer("there is nothing to make an environment package of: supply a map of any kind")
         self.left_over()
         self.scripts(variables)
-        if self.context.stored and not self.complete:  # with derived maps it says more than what is stored
-            self.out |= _content.pack(self.layers, self.out, self.context.attribution)
+        if self.context.stored is not None and not self.complete:  # else the maps say something else
+            self.out |= _content.pack(self.layers, self.out, self.context.stored)
         return {f"{CONFIG}/{path}": data for path, data in self.out.items()}
 
     # --- one map ---
