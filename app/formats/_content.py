@@ -35,6 +35,9 @@ VERSION = 1
 
 _TYPES = frozenset({"|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8", "|b1"})
 
+_KINDS: Mapping[str, type] = {"properties": dict, "crs": str, "binary": bool, "negate": bool}
+"""Types of fields that the layers themselves do not check."""
+
 
 @dataclass(frozen=True, slots=True)
 class Content:
@@ -153,6 +156,9 @@ def _decoded(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes], l
         return Resources({str(path): files[name] for path, name in row["files"].items()})
     most = limits.voxels if key.layer == "voxels" else limits.pixels
     values = {name: _value(value, files, most) for name, value in row.items()}
+    for name, wanted in _KINDS.items():
+        if not isinstance(values.get(name, wanted()), wanted):
+            raise TypeError(f"{name} of the {key.layer} is no {wanted.__name__}")
     part: Part = kind(**values)
     return part
 

@@ -439,6 +439,7 @@ def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> N
     array = next(part for part in top["parts"] if part["layer"] == "occupancy")["cells"]
     damaged: list[Any] = [{**top, "parts": [{"layer": "x"}]}, {**top, "levels": 3}, {**top, "datum": {"latitude": 89}}]
     damaged += [{**top, "parts": [{**part, "ids": ["a", "a"]} for part in top["parts"]]}]
+    damaged += [{**top, "parts": [{**part, "properties": 5} for part in top["parts"]]}]
     for wrong in ({"shape": [-1, 2]}, {"shape": [2**40, 2**20]}, {"type": "|O"}, {"file": "../x"}):
         parts_ = [p | {"cells": array | wrong} if p["layer"] == "occupancy" else p for p in top["parts"]]
         damaged.append({**top, "parts": parts_})
