@@ -364,7 +364,7 @@ def test_odd_variables_are_left_out_and_told(tmp_path: Path) -> None:
 
 
 def test_a_new_writer_of_an_inner_map_makes_a_new_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    version: Any = SimpleNamespace(datum=None, levels=(), templates=NO_TEMPLATES, closures=None)
+    version: Any = SimpleNamespace(environment="e", datum=None, levels=(), templates=NO_TEMPLATES, closures=None)
     way = recipe.Chain((), ())
 
     def keys() -> list[str]:
