@@ -19,7 +19,7 @@ from typing import Any
 from app import parameters
 from app.errors import Ambiguous, CannotConvert, CannotDerive, Problem
 from app.model.features import Features
-from app.model.grid import OccupancyGrid
+from app.model.grid import FREE, UNKNOWN, OccupancyGrid
 from app.model.layers import Layer, Layers, Part
 from app.model.voxels import VoxelMap
 
@@ -204,9 +204,10 @@ def with_values(steps: Iterable[Step], values: Mapping[str, Any]) -> tuple[Step,
 
 
 def _says_nothing(part: Part) -> bool:
-    """Whether a derived part is no information: no items, no voxels, or one value in all cells."""
+    """Whether a derived part is no information: no items, no voxels, or all cells unknown or free alike."""
     if isinstance(part, OccupancyGrid):
-        return bool((part.cells == part.cells[0, 0]).all())
+        first = part.cells[0, 0]
+        return bool(first in (FREE, UNKNOWN) and (part.cells == first).all())
     return isinstance(part, Features | VoxelMap) and not len(part)
 
 
