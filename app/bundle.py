@@ -18,11 +18,11 @@ import shapely
 from numpy.typing import NDArray
 
 from app import formats
-from app.errors import BadUpload, Invalid, Problem, UnreadableFile
-from app.formats import Files, Format, Group, Limits, ReadContext, _archive, _json, _shell, _xml, _yaml
+from app.errors import BadUpload, FleetMapError, Invalid, Problem, UnreadableFile
+from app.formats import Files, Format, Group, Limits, ReadContext, _archive, _content, _json, _shell, _xml, _yaml
 from app.model import network
 from app.model.features import Features, concatenate, from_columns, unique_ids
-from app.model.frame import GROUND, Datum, Level
+from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum, Level
 from app.model.geodesy import local_frame
 from app.model.imagery import Picture
 from app.model.layers import NETWORK, SITE, ZONES, Layer, Layers, Part, PartKey, Resources, is_empty, join_levels
@@ -113,6 +113,7 @@ class Bundle:
     warnings: list[Problem] = field(default_factory=list)
     fence: shapely.Polygon | None = None
     notices: dict[str, str] = field(default_factory=dict)
+    credits: Mapping[PartKey, tuple[str, ...]] = field(default_factory=dict)
     inner: bool = False
 
     def credit(self, key: PartKey) -> tuple[str, ...]:
@@ -121,6 +122,7 @@ class Bundle:
         said = part.document.get("attribution", ()) if isinstance(part, Features) else ()
         said = part.attribution if isinstance(part, Picture) else said
         texts = [text for text in said if isinstance(text, str)] if isinstance(said, list | tuple) else []
+        texts += self.credits.get(key, ())
         names, _ = self.origin.get(key, ((), ""))
         for notice, text in sorted(self.notices.items()):
             folder = notice.rpartition("/")[0]
@@ -173,12 +175,16 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
     drawn_layer(hints.layer)
     if not files:
         raise Invalid("the upload has no file: send at least one as form field 'files'")
+    bundle = Bundle(files={name: Use() for name in files}, inner=inner)
+    if (content := _content.find(files)) is not None:
+        if _take_content(files, content, hints, limits, bundle):
+            return bundle
+        files = {name: data for name, data in files.items() if name not in _content.owned(files, content)}
     if hints.format is not None and formats.get_format(hints.format).holds:
         # A folder of other formats' maps is what any upload may be: each file is found out by its content.
         held = [n for n in files if template_folder(n) or PurePosixPath(n).name in VARIABLES_FILES]
         if held:
             hints = dataclasses.replace(hints, format=None)
-    bundle = Bundle(files={name: Use() for name in files}, inner=inner)
     variables = _read_variables(files, bundle)
     others = {n: d for n, d in files.items() if n not in variables}
     groups, rest = _group(others, hints) if any(others.values()) or not variables else ([], sorted(others))
@@ -215,6 +221,31 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
         raise UnreadableFile(detail, problems)
     _choose_datum(bundle, known)
     return bundle
+
+
+def _take_content(files: Files, main: str, hints: Hints, limits: Limits, bundle: Bundle) -> bool:
+    """Take the layers that a package carries exactly; False where its maps count, with the reason as a warning."""
+    if dataclasses.replace(hints, format=None) != Hints() or hints.format not in (None, "environment"):
+        found: _content.Content | str = "the upload says how its maps are to be read"
+    else:
+        try:
+            with _blamed_on(main):
+                found = _content.read(files, main, limits)
+        except BadUpload:
+            raise
+        except (*formats.BAD_INPUT, FleetMapError, shapely.errors.ShapelyError) as error:
+            reason = f"what is stored beside the maps is damaged: {formats.explain(error)[1]}; remove its folder"
+            raise UnreadableFile(f"{main}: {reason}", [Problem(reason, main)]) from error
+    if isinstance(found, str):
+        for name in _content.owned(files, main):
+            bundle.files[name] = Use("environment", used=False)
+        bundle.warnings.append(Problem(f"not used, the maps of the package count: {found}", main))
+        return False
+    bundle.files = {name: Use("environment", used=True) for name in files}
+    bundle.parts, bundle.datum, bundle.levels = dict(found.layers.parts), found.layers.datum, found.layers.levels
+    bundle.origin = dict.fromkeys(bundle.parts, ((main,), "environment"))
+    bundle.credits = found.credits
+    return True
 
 
 def _unknown(name: str, data: bytes, limits: Limits) -> Problem:
@@ -262,7 +293,7 @@ def corner(parts: Mapping[PartKey, Part]) -> Datum | None:
     west, south, east = boxes[:, 0].min(), boxes[:, 1].min(), boxes[:, 2].max()
     if east - west > 180.0:  # the data lies on both sides of the antimeridian: west is the smallest eastern longitude
         west = boxes[boxes[:, 0] > 0.0, 0].min()
-    return Datum(float(np.clip(south, -85.0, 85.0)), float(west))
+    return Datum(float(np.clip(south, -MAX_DATUM_LATITUDE, MAX_DATUM_LATITUDE)), float(west))
 
 
 def _notice(name: str, data: bytes) -> str | None:
@@ -607,3 +638,9 @@ def _choose_datum(bundle: Bundle, known: Known) -> None:
             f"{chosen.longitude!r}, is taken; upload a datum.yaml or PATCH the environment to set another"
         )
         bundle.warnings.append(Problem(reason))
+        if abs(chosen.latitude) == MAX_DATUM_LATITUDE:
+            reason = (
+                f"the data begins at or beyond {chosen.latitude:g} degrees of latitude, and no datum lies nearer to a "
+                "pole: metres far from the datum are not exact; use local metres there"
+            )
+            bundle.warnings.append(Problem(reason))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from app.bundle import Bundle, Hints, Known, corner, read, template_folder, unpa
 from app.errors import BadUpload, Invalid, UnreadableFile
 from app.formats import Limits
 from app.model.features import Features, features
+from app.model.frame import Datum
 from app.model.layers import PartKey
 
 LIMITS = Limits()
@@ -158,6 +160,16 @@ def test_without_a_datum_the_south_west_corner_is_taken_with_a_warning() -> None
     assert bundle.datum is not None
     assert (bundle.datum.latitude, bundle.datum.longitude) == (53.26, -0.52)
     assert any("south-west corner" in w.problem for w in bundle.warnings)
+
+
+@pytest.mark.parametrize("latitude", [88.0, -88.0])
+def test_data_nearer_to_a_pole_than_a_datum_may_be_is_warned_of(latitude: float) -> None:
+    point = b'{"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [10, %g]}}' % latitude
+    told = read({"a.geojson": point}, Hints(), Known(), Limits())
+    assert told.datum == Datum(math.copysign(85.0, latitude), 10.0)
+    assert any("no datum lies nearer to a pole" in w.problem for w in told.warnings)
+    with pytest.raises(BadUpload, match="must be between -85 and 85"):
+        read({"datum.yaml": b"datum_latitude: %g\ndatum_longitude: 10\n" % latitude}, Hints(), Known(), Limits())
 
 
 def test_the_corner_across_the_antimeridian_is_the_western_end() -> None:

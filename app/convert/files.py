@@ -66,7 +66,8 @@ def _offline(
     if site.asks_for_all(known, asked):
         wanted = None  # further parts may be derived from any layer
     while True:
-        knowing = Known(datum, None, wanted, not known.outlines, known.drawing or known.holds)
+        cells = bool(asked) or not known.outlines  # an option may ask for the images, too
+        knowing = Known(datum, None, wanted, cells, known.drawing or known.holds)
         told = bundle.read(bundle.unpack(load(), limits), hints, knowing, limits)
         have = told.layers(datum).layers
         if not asked and any(layers <= have for layers in known.needs.one_of):

@@ -18,7 +18,7 @@ from app.convert.recipe import Chain, Hindrance, Spread
 from app.derive import Step
 from app.derive._crossings import crossings
 from app.errors import CannotConvert, CannotDerive, FleetMapError, MissingLayer, Problem
-from app.formats import Format, Inner, WriteContext, _archive
+from app.formats import UNTITLED, Format, Inner, WriteContext, _archive
 from app.model.closures import Closures
 from app.model.features import Features
 from app.model.frame import GROUND
@@ -60,7 +60,10 @@ def make(
     layers = applied_closures.load(store, version, way.keys)
     entries = {e.key: e for e in version.parts}
     templates, closures = version.templates, version.closures
-    return write(known, layers, values, way, entries, templates=templates, closures=closures, spread=spread)
+    title = version.environment
+    return write(
+        known, layers, values, way, entries, templates=templates, closures=closures, spread=spread, title=title
+    )
 
 
 def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) -> Hindrance | None:
@@ -111,16 +114,18 @@ def write(
     closures: Closures | None = None,
     spread: Spread | None = None,
     around: Layers | None = None,
+    title: str = UNTITLED,
 ) -> Written:
     """Derive and write. ``entries`` (of a stored version) or ``origin`` and ``credit`` (of files) say where each part
     came from, and under which licences and credits. templates: for the maps that a format holds. closures: to apply.
-    spread: write every part that is derived. around: further layers, in which edges may meet obstacles.
+    spread: write every part that is derived. around: further layers, in which edges may meet obstacles. title: the
+    environment's name, for formats with a place for one.
     """
     notes = derive.Notes()
     options = recipes.own_options(known, values)
     if entries is None:  # of files; what is stored was loaded without them
         layers = applied_closures.without_timed_marks(layers)
-    source = _Source(layers, way, entries, origin, credit, templates, closures, around or Layers())
+    source = _Source(layers, way, entries, origin, credit, templates, closures, around or Layers(), title)
     if spread is None:
         return _written(known, derive.run(way.steps, layers, notes), options, source, notes)
     try:
@@ -146,6 +151,7 @@ class _Source:
     templates: Templates
     closures: Closures | None
     around: Layers
+    title: str
 
 
 def _written_each(
@@ -183,12 +189,13 @@ def empty_report(known: Format) -> dict[str, Any]:
 def _written(known: Format, made: Layers, options: Any, source: _Source, notes: derive.Notes) -> Written:
     """One map of what was derived and what was there."""
     layers, way, entries, origin = source.layers, source.way, source.entries, source.origin
-    credit, templates, closures = source.credit, source.templates, source.closures
-    context = WriteContext(options=options)
+    credit, closures = source.credit, source.closures
+    noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
+    context = WriteContext(source.title, options, stored=None if closures is not None and closures.items else noted)
     inner: list[dict[str, Any]] = []
     inner_closures: list[list[dict[str, Any]]] = []
     if known.holds:
-        context.make = partial(_inner, entries, origin, credit, templates, closures, inner, inner_closures)
+        context.make = partial(_inner, source, inner, inner_closures)
     chosen = known.choose(sorted(k for k in made.parts if k.layer in known.carries), context.options)
     used = Layers({k: made.parts[k] for k in chosen}, made.datum, made.levels)
     closed = applied_closures.ClosureReport()
@@ -198,7 +205,6 @@ def _written(known: Format, made: Layers, options: Any, source: _Source, notes: 
         if closed.emptied and _lacks_edges(known, applied):
             applied, closed = applied_closures.close(known, used, closures, drawn, mark=True)
         used = applied
-    noted = {k: e.provenance.attribution for k, e in entries.items()} if entries is not None else credit or {}
     lines = _told(used, layers, way, entries or {}, origin or {}, noted)
     context.attribution = tuple(sorted(credits_of(lines)))  # whichever part came first: equal content, equal bytes
     files = formats.write(known, used, context)
@@ -250,6 +256,7 @@ def from_layers(
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None = None,
     credit: Mapping[PartKey, Sequence[str]] | None = None,
     closures: Closures | None = None,
+    title: str = UNTITLED,
 ) -> Written:
     """A map by the cheapest way that works on these layers. Raises what planning, deriving and writing raise."""
     if site.asks_for_all(known, asked):
@@ -265,7 +272,9 @@ def from_layers(
             raise recipes.exhausted(error, failed) from error
         kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
         try:
-            return write(known, kept, asked, way, entries, origin, credit, closures=closures, around=layers)
+            return write(
+                known, kept, asked, way, entries, origin, credit, closures=closures, around=layers, title=title
+            )
         except CannotDerive as error:
             without |= {error.step}
             failed.append(Hindrance(error.step, error.detail, error.choose))
@@ -332,11 +341,7 @@ def _as_version(layers: Layers) -> Version:
 
 
 def _inner(
-    entries: Mapping[PartKey, PartEntry] | None,
-    origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None,
-    credit: Mapping[PartKey, Sequence[str]] | None,
-    templates: Templates,
-    closures: Closures | None,
+    source: _Source,
     derivations: list[dict[str, Any]],
     closed: list[list[dict[str, Any]]],
     name: str,
@@ -346,9 +351,17 @@ def _inner(
 ) -> Inner:
     """What ``WriteContext.make`` does; layers that were derived on the way are noted in ``derivations``."""
     known = formats.get_format(name)
-    asked = {**resolve(templates, known).values, **values}
+    asked = {**resolve(source.templates, known).values, **values}
     made = from_layers(
-        known, layers, asked, derived=derived, entries=entries, origin=origin, credit=credit, closures=closures
+        known,
+        layers,
+        asked,
+        derived=derived,
+        entries=source.entries,
+        origin=source.origin,
+        credit=source.credit,
+        closures=source.closures,
+        title=source.title,
     )
     report = made.report
     derivations += [line for line in report["layers"] if line["information"] == "derived"]

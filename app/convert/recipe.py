@@ -23,6 +23,7 @@ from app.model.features import Features
 from app.model.layers import LAYERS, MAP, Layer, Layers, PartKey
 from app.model.names import did_you_mean
 from app.model.templates import Templates
+from app.model.voxels import VoxelMap
 from app.store.values import PartEntry, Version
 
 SUPPLY: Mapping[Layer, str] = {
@@ -44,7 +45,8 @@ class Stock:
 
     anchors: of each part, which of ``local`` and ``wgs84`` its items are. blank: parts without items; an empty file is
     a map of its own format, and of no other. pinned: by layer, the derivations and parameters that a version was
-    given its content by; where that content is stale, it is left out of ``keys`` and made anew by them.
+    given its content by; where that content is stale, it is left out of ``keys`` and made anew by them. drawn: parts
+    that a step made for maps alone (see ``Derivation.last``), which are no evidence for other derivations.
     """
 
     keys: frozenset[PartKey]
@@ -52,9 +54,12 @@ class Stock:
     anchors: Mapping[PartKey, frozenset[str]] = field(default_factory=dict)
     blank: frozenset[PartKey] = frozenset()
     pinned: Mapping[Layer, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
+    drawn: frozenset[PartKey] = frozenset()
 
     def seen_by(self, known: Format) -> Stock:
-        """The same with the blank parts that came from this format."""
+        """The same with the blank parts that came from this format; a folder of maps holds all of them."""
+        if known.holds:
+            return replace(self, keys=self.keys | self.blank, blank=frozenset())
         own = {k for k in self.blank if k.name == known.family or (k.layer == "voxels" and k.layer in known.carries)}
         return replace(self, keys=self.keys | own, blank=frozenset()) if own else self
 
@@ -62,6 +67,11 @@ class Stock:
     def layers(self) -> frozenset[Layer]:
         """The layers with content; a datum alone is location enough."""
         return frozenset({k.layer for k in self.keys} | ({"location"} if self.datum else set()))
+
+    @property
+    def dead(self) -> frozenset[Layer]:
+        """The layers that nothing can be derived from, since all of their parts are drawn."""
+        return frozenset({k.layer for k in self.drawn} - {k.layer for k in self.keys - self.drawn})
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +151,8 @@ def stock(version: Version) -> Stock:
     entries = [e for e in entries if e.key.layer not in pinned]
     anchors = {e.key: frozenset(name for name, box in (e.bounds or {}).items() if box) for e in entries}
     blank = frozenset(e.key for e in version.parts if not e.count)
-    return Stock(frozenset(e.key for e in entries), version.datum is not None, anchors, blank, pinned)
+    drawn = frozenset(e.key for e in entries if not e.provenance.edited and derive.is_drawn(e.provenance.steps))
+    return Stock(frozenset(e.key for e in entries), version.datum is not None, anchors, blank, pinned, drawn)
 
 
 def stock_of(layers: Layers) -> Stock:
@@ -150,10 +161,10 @@ def stock_of(layers: Layers) -> Stock:
     blank: set[PartKey] = set()
     anchors: dict[PartKey, frozenset[str]] = {}
     for key, part in layers.parts.items():
+        if isinstance(part, Features | VoxelMap) and not len(part):
+            blank.add(key)
+            continue
         if isinstance(part, Features):
-            if not len(part):
-                blank.add(key)
-                continue
             some = {"local"} if part.local.any() else set()
             anchors[key] = frozenset(some | ({"wgs84"} if part.needs_datum else set()))
         keys.add(key)
@@ -220,7 +231,7 @@ def chain(
     if not _is_whole(known, available):
         _check_anchor(known, available, sorted({*chosen, *(k for k in keys if k.layer in needed)}))
     read = {layer for step in best.steps for layer in step.reads}
-    keys = sorted({*chosen, *(k for k in keys if k.layer in read)})
+    keys = sorted({*chosen, *(k for k in keys if k.layer in read and k not in available.drawn)})
     remembered = {name: value for steps in available.pinned.values() for name, value in steps.items()}
     steps = [derive.with_values([s], {**remembered.get(s.name, {}), **asked})[0] for s in best.steps]
     return Chain(tuple(steps), tuple(keys))
@@ -238,7 +249,12 @@ def _named(
         return None
     further = asked.keys() - {f.name for f in dataclasses.fields(known.write_options)}
     for d in sorted(derive.all_derivations().values(), key=lambda d: (d.cost, d.name)):
-        if d.gives != layer or name not in d.makes or not d.needs <= available.layers or d.name in without:
+        if (
+            d.gives != layer
+            or name not in d.makes
+            or not d.needs <= available.layers - available.dead
+            or d.name in without
+        ):
             continue
         if level is not None and not any(k.level == level and k.layer in d.needs for k in available.keys):
             continue
@@ -252,7 +268,7 @@ def _named(
 def _best(known: Format, available: Stock, without: frozenset[str], *, derived: bool = True) -> derive.Plan | None:
     best: derive.Plan | None = derive.Plan((), 0.0) if _is_whole(known, available) else None
     for wanted in known.needs.one_of:
-        found = derive.plan(available.layers, wanted, without)
+        found = derive.plan(available.layers, wanted, without, available.dead)
         if found is not None and (derived or not found.steps) and (best is None or found.cost < best.cost):
             best = found
     return best
@@ -278,11 +294,16 @@ def _forced(
     for name, step in everything.items() if derived else ():
         if not names <= derive.takes(name) or step.gives not in useful or name in without:
             continue
-        less = replace(available, keys=frozenset(k for k in available.keys if k.layer != step.gives))
+        kept = frozenset(k for k in available.keys if k.layer != step.gives)
+        less = replace(available, keys=kept, drawn=available.drawn & kept)
         rivals = frozenset(n for n, d in everything.items() if d.gives == step.gives and n != name)
         # Only by what the step gives: a format that a grid alone is enough for would do without its objects.
         wishes = [wanted for wanted in known.needs.one_of if step.gives in wanted]
-        ways = [way for wanted in wishes if (way := derive.plan(less.layers, wanted, without | rivals)) is not None]
+        ways = [
+            way
+            for wanted in wishes
+            if (way := derive.plan(less.layers, wanted, without | rivals, less.dead)) is not None
+        ]
         ways = [way for way in ways if any(s.name == name for s in way.steps)]
         if ways:
             way = min(ways, key=lambda one: one.cost)
@@ -394,6 +415,8 @@ def _key(
         "levels": [[level.name, level.elevation] for level in version.levels],
     }
     ingredients |= applied_closures.ingredients(version, known, way.keys)
+    if known.titled or known.holds:
+        ingredients["title"] = version.environment
     if spread is not None:
         ingredients["spread"] = dataclasses.asdict(spread)
     if known.holds:  # its bytes are those of other writers and, where they lack a layer, of derivations

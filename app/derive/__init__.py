@@ -18,7 +18,10 @@ from typing import Any
 
 from app import parameters
 from app.errors import Ambiguous, CannotConvert, CannotDerive, Problem
-from app.model.layers import Layer, Layers
+from app.model.features import Features
+from app.model.grid import FREE, UNKNOWN, OccupancyGrid
+from app.model.layers import Layer, Layers, Part
+from app.model.voxels import VoxelMap
 
 
 @dataclass(slots=True)
@@ -149,10 +152,21 @@ def all_derivations() -> Mapping[str, Derivation]:
     return dict(sorted(_registry.items()))
 
 
-def plan(available: frozenset[Layer], wanted: frozenset[Layer], without: frozenset[str] = frozenset()) -> Plan | None:
+def is_drawn(steps: Iterable[Mapping[str, Any]]) -> bool:
+    """Whether one of these steps, as provenance tells them, is the last one that a map may take (see ``last``)."""
+    known = all_derivations()
+    return any(name in known and known[name].last for name in (str(step.get("step")) for step in steps))
+
+
+def plan(
+    available: frozenset[Layer],
+    wanted: frozenset[Layer],
+    without: frozenset[str] = frozenset(),
+    dead: frozenset[Layer] = frozenset(),
+) -> Plan | None:
     """The cheapest chain that adds what is wanted to what is available (Dijkstra over sets of layers), or None.
 
-    without: names of derivations that must not be part of it.
+    without: names of derivations that must not be part of it. dead: available layers that nothing is derived from.
     """
     queue: list[tuple[float, int, frozenset[Layer], tuple[Step, ...]]] = [(0.0, 0, available, ())]
     done: set[frozenset[Layer]] = set()
@@ -164,9 +178,9 @@ def plan(available: frozenset[Layer], wanted: frozenset[Layer], without: frozens
         if have in done:
             continue
         done.add(have)
-        dead = {step.gives for step in steps if all_derivations()[step.name].last}
+        blocked = dead | {step.gives for step in steps if all_derivations()[step.name].last}
         for d in all_derivations().values():
-            if d.needs & dead:
+            if d.needs & blocked:
                 continue
             if d.needs <= have and d.gives not in have and d.name not in without and not d.makes:
                 pushed += 1
@@ -189,6 +203,14 @@ def with_values(steps: Iterable[Step], values: Mapping[str, Any]) -> tuple[Step,
     return tuple(out)
 
 
+def _says_nothing(part: Part) -> bool:
+    """Whether a derived part is no information: no items, no voxels, or all cells unknown or free alike."""
+    if isinstance(part, OccupancyGrid):
+        first = part.cells[0, 0]
+        return bool(first in (FREE, UNKNOWN) and (part.cells == first).all())
+    return isinstance(part, Features | VoxelMap) and not len(part)
+
+
 def run(steps: Iterable[Step], layers: Layers, notes: Notes | None = None) -> Layers:
     """Carry out a plan: the layers with what each step adds. CannotDerive names the step that found nothing to use."""
     notes = notes or Notes()
@@ -199,5 +221,9 @@ def run(steps: Iterable[Step], layers: Layers, notes: Notes | None = None) -> La
         except CannotConvert as error:
             choose = isinstance(error, Ambiguous)
             raise CannotDerive(error.detail, error.problems, step=step.name, choose=choose) from error
+        if not known.makes and not known.last and all(map(_says_nothing, made.of(step.gives).values())):
+            needs = " and ".join(step.needs)
+            reason = f"{step.name} finds nothing in the stored {needs} to make {step.gives} of: supply {step.gives}"
+            raise CannotDerive(f"{reason}, or {needs} with more in it", [Problem(reason)], step=step.name)
         layers = Layers({**layers.parts, **made.parts}, layers.datum or made.datum, layers.levels)
     return layers

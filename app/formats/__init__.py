@@ -126,6 +126,10 @@ class Inner:
     warnings: tuple[Problem, ...] = ()
 
 
+UNTITLED = "map"
+"""What a map is called that is made for no environment."""
+
+
 @dataclass(slots=True)
 class WriteContext:
     """What a writer is told, and where it declares what it lost or made up (loss is data).
@@ -133,13 +137,15 @@ class WriteContext:
     title: the environment's name, for formats with a place for one. options: the format's own write options.
     attribution: licences and credits of the sources, for formats with a place for them. make: for formats that hold
     others: a map of the named format from these layers, with these of its options, its missing layers derived or not;
-    it raises NotFound for a format that is not there, and what planning and writing raise.
+    it raises NotFound for a format that is not there, and what planning and writing raise. stored: the
+    licences and credits of each part, where the layers are what is stored; None where a closure has changed them.
     """
 
-    title: str = "map"
+    title: str = UNTITLED
     options: Any = None
     attribution: tuple[str, ...] = ()
     make: Callable[[str, Layers, Mapping[str, Any], bool], Inner] | None = None
+    stored: Mapping[PartKey, Sequence[str]] | None = None
     dropped: list[dict[str, Any]] = field(default_factory=list)
     template: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[Problem] = field(default_factory=list)
@@ -223,7 +229,8 @@ class Format:
     picture without a place); empty for other files. completing: the read options that say it.
     looks_at: files of other maps of the upload that it looks into. parts: the options that select a stored part, for
     formats whose files hold one part each. holds: it is a folder of other formats' maps. marks_blocked: it can
-    express a blocked edge, so that such an edge stays in it; other formats leave it out. bends: see ``Bends``.
+    express a blocked edge, so that such an edge stays in it; other formats leave it out. bends: see ``Bends``. titled:
+    it names the environment (``WriteContext.title``), so its bytes depend on that name.
     """
 
     name: str
@@ -258,6 +265,7 @@ class Format:
     completing: frozenset[str] = frozenset()
     marks_blocked: bool = False
     bends: Bends = "shape"
+    titled: bool = False
 
 
 @dataclass(frozen=True, slots=True)

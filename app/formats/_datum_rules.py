@@ -13,6 +13,7 @@ from typing import Any
 from app.errors import Problem
 from app.formats import Files, _yaml
 from app.formats._rules import LIMITS, doubted, is_number, numbers, refused, shown
+from app.model.frame import MAX_DATUM_LATITUDE
 
 SIZES = ("xmin", "xmax", "ymin", "ymax")
 SAME_DEGREES = 1e-9
@@ -32,9 +33,12 @@ def check(files: Files) -> Iterator[Problem]:
             yield refused(f"must be degrees within ±{most:g}, is {shown(value)}", main, where=key)
         else:
             place[key] = value
+    if abs(place.get("datum_latitude", 0.0)) > MAX_DATUM_LATITUDE:
+        reason = f"beyond ±{MAX_DATUM_LATITUDE:g} degrees no local frame is exact: this server refuses such a datum"
+        yield refused(reason, main, where="datum_latitude")
     fence = top.get("gnss_fence")
     corners = fence.get("gnss_fence_coords") if isinstance(fence, dict) else None
-    if corners is None:
+    if corners is None or corners == []:  # as the writer leaves it where there is no fence
         yield doubted("the environment_template's tools draw the map from the fence", main, where="gnss_fence")
     elif not isinstance(corners, list) or len(corners) < 3 or not all(numbers(c, 2, 3) for c in corners):
         reason = "must be a list of three corners [latitude, longitude] or more"

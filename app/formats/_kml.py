@@ -6,7 +6,8 @@ metres.
 **What is kept of a drawing.** A placemark or overlay is one object. ``properties.kml`` keeps where it stood and what
 the canonical words cannot say:
 
-``document``  name of the file it came from; ``Features.document["kml"]["documents"][name]`` has the rest of that file
+``document``  key of the file it came from: ``Features.document["kml"]["documents"][key]`` has the rest of that file, of
+              which the key is made, not of the file's name: equal drawings are equal content
 ``place``     its number in that file
 ``xml``       the element as text, with slots instead of what the canonical words say: ``<?n?>`` the name, ``<?c?>`` a
               list of coordinates, ``<?d NAME?>`` a plain value of its ExtendedData, which stands in ``properties``
@@ -25,6 +26,7 @@ in common stands in the ExtendedData of their folder, marked by ``fleetmap``.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections import Counter
@@ -46,6 +48,7 @@ from app.model.features import MAX_ID, NO_GEOMETRY, Features, unique_ids
 from app.model.frame import MAX_METRES, Datum, Level
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
+from app.model.imagery import Picture
 from app.model.layers import MAP, NETWORK, SITE, VECTOR_LAYERS, ZONES, Layers, Part, PartKey
 
 FAMILY = "kml"
@@ -59,9 +62,14 @@ GEOMETRIES = SIMPLE | {"MultiGeometry", "Model", "Track", "MultiTrack"}
 
 MARK = "fleetmap"
 STYLE = "fleetmap-"
-USUAL_PART: Mapping[str, str] = {"topology": NETWORK, "location": SITE, "zones": ZONES, "occupancy": MAP, "objects": ""}
+USUAL_PART: Mapping[str, str] = {
+    **{"topology": NETWORK, "location": SITE, "zones": ZONES, "occupancy": MAP, "objects": "", "imagery": "satellite"}
+}
 OWN_WORDS = frozenset({"layer", "level", "part", "id", "local", "geometry", "more", MARK})
 """Names in ExtendedData that place an item; a property of such a name travels in ``more``."""
+
+PLACE_WORDS = frozenset({"layer", "level", "part", "id"})
+"""Those whose values are names."""
 
 RESERVED = OWN_WORDS | {
     *("kind", "name", "source", "target", "orientation", "action", "speed_limit", "width", "value", "expires"),
@@ -70,6 +78,9 @@ RESERVED = OWN_WORDS | {
     *("environment", "occupancy_grid", "octomap", "satellite", "pcd", "ply", "las", "prm", "ffr_network", "rmf_site"),
 }
 """Property names that mean something to us: a drawing's own value of that name stays under ``properties.kml.data``."""
+
+DOCUMENT_KEY_DIGITS = 16
+"""Hexadecimal digits of a SHA-256 that serve as a drawing's key among the drawings of an environment."""
 
 COORDINATES, NAME, END = "<?c?>", "<?n?>", "<?end?>"
 SLOT = re.compile(r"<\?(c|n|d ([^?]*))\?>")
@@ -431,12 +442,12 @@ class _Item:
 
 
 def read_kml(
-    data: bytes, context: ReadContext, name: str, pictures: Mapping[str, bytes], entry: str | None = None
+    data: bytes, context: ReadContext, pictures: Mapping[str, bytes], entry: str | None = None
 ) -> tuple[Layers, set[str]]:
     """KML -> layers, and the names of the pictures that became grids.
 
-    name: of the file, under which its document is kept. pictures: what relative references may mean (KMZ). entry: the
-    name of this document inside its archive. Raises UnreadableFile with the line.
+    pictures: what relative references may mean (KMZ). entry: the name of this document inside its archive. Raises
+    UnreadableFile with the line.
     """
     root = _xml.parse(data, context.limits, remove_blank_text=True)
     if local_name(root) not in CONTAINERS | ITEMS:
@@ -447,7 +458,7 @@ def read_kml(
     _xml.warn_of_active_content(data, context)
     _check_values(root, context)
     reader = _Reader(context, pictures)
-    reader.read(root, name, entry)
+    reader.read(root, entry)
     return reader.layers(), reader.used
 
 
@@ -503,21 +514,21 @@ class _Reader:
         self.datum: Datum | None = None
         self.levels: dict[str, float] = {}
         self.own: dict[PartKey, _Own] = {}
-        self.grids: dict[PartKey, OccupancyGrid] = {}
+        self.rasters: dict[PartKey, OccupancyGrid | Picture] = {}
         self.columns: dict[str, list[tuple[list[str], list[Any], list[dict[str, Any]]]]] = {}
         self.documents: dict[str, dict[str, Any]] = {}
         self.credit: list[str] = []
 
-    def read(self, root: etree._Element, name: str, entry: str | None) -> None:
+    def read(self, root: etree._Element, entry: str | None) -> None:
         """A document, and those that we have put inside it."""
         marks = self._marks(root)
         for element, words in marks:
             if words.get(MARK) == "document" and element is not root and element.getparent() is not None:
-                inner = words.get("document") or name
+                level = words.get("level") or self.context.level
                 self._detach(element)
-                self._read_one(element, inner, words.get("entry"), words.get("level") or self.context.level, [])
+                self._read_one(element, words.get("document"), words.get("entry"), level, [])
         ours = [(e, w) for e, w in marks if w.get(MARK) != "document"]
-        self._read_one(root, name, entry, self.context.level, ours)
+        self._read_one(root, None, entry, self.context.level, ours)
 
     def _marks(self, root: etree._Element) -> list[tuple[etree._Element, dict[str, str]]]:
         """Containers that carry our mark, innermost last, with their words."""
@@ -525,7 +536,7 @@ class _Reader:
         for extended in root.iter("{*}ExtendedData"):
             parent = extended.getparent()
             if parent is not None and local_name(parent) in CONTAINERS:
-                words = {n: v.text or "" for n, v in _values(extended)}
+                words = _words(_values(extended), PLACE_WORDS | {"document", "entry"})
                 if MARK in words:
                     out.append((parent, words))
         return out
@@ -542,7 +553,7 @@ class _Reader:
     def _read_one(
         self,
         root: etree._Element,
-        name: str,
+        name: str | None,
         entry: str | None,
         level: str,
         ours: list[tuple[etree._Element, dict[str, str]]],
@@ -556,7 +567,7 @@ class _Reader:
         _check_places(items, parsed)
         mine, theirs = [], []
         for item in items:
-            words = dict(_spoken(item.data))
+            words = _words(item.data, PLACE_WORDS)
             if words.get("layer") in USUAL_PART:
                 mine.append((item, words))
             else:
@@ -583,8 +594,8 @@ class _Reader:
                 parent.remove(element)
             layer = words["layer"]
             title = child_text(element, "name")
-            if layer == "occupancy":
-                self._take_grid(element, words, title)
+            if layer in ("occupancy", "imagery"):
+                self._take_raster(element, words, title)
                 continue
             properties: dict[str, Any] = {"name": title} if title else {}
             for label, text in words.items():
@@ -612,39 +623,57 @@ class _Reader:
             raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)])
         self.datum = Datum(**numbers)
 
-    def _take_grid(self, element: etree._Element, words: Mapping[str, str], title: str) -> None:
-        """A grid whose picture travels with the drawing (KMZ): the picture's palette index is the cell."""
+    def _take_raster(self, element: etree._Element, words: Mapping[str, str], title: str) -> None:
+        """A grid or a picture of ours, where its image travels with the drawing."""
         icon = child(element, "Icon")
         href = "" if icon is None else child_text(icon, "href")
-        label = words.get("part") or title or MAP
-        picture = self.pictures.get(href)
-        if picture is None:
+        layer = words["layer"]
+        label = words.get("part") or title or USUAL_PART[layer]
+        what = "grid" if layer == "occupancy" else "picture"
+        data = self.pictures.get(href)
+        if data is None:
             self.context.warn(
-                "its picture is not here (it travels in KMZ only), so the grid is left out",
+                f"its image {href!r} is not in the upload, so the {what} is left out: upload the KMZ, or both files",
                 line=element.sourceline,
                 where=label,
             )
             return
         said = {n: unspell(t) for n, t in words.items()}
-        image = _image.read_image(picture, self.context.limits)
+        self.used.add(href)
+        read = self._grid if layer == "occupancy" else self._picture
+        try:
+            self.rasters[self._key(words, layer)] = read(data, href, said)
+        except (KeyError, TypeError) as error:
+            reason = f"the {what} {label} lacks what places it: {error}"
+            raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)]) from error
+
+    def _grid(self, data: bytes, href: str, said: Mapping[str, Any]) -> OccupancyGrid:
+        """A grid: the image's palette index is the cell."""
+        image = _image.read_image(data, self.context.limits)
         if image.mode != "P":
             raise UnreadableFile(f"{href} is no longer the picture of a grid: its colours have changed")
-        self.used.add(href)
-        origin = said.get("origin")
-        if not isinstance(origin, list) or "resolution" not in said:
-            reason = f"grid {label} has no resolution and origin"
-            raise UnreadableFile(reason, [Problem(reason, line=element.sourceline)])
         properties = said.get("properties")
-        self.grids[self._key(words, "occupancy")] = OccupancyGrid(
+        return OccupancyGrid(
             np.ascontiguousarray(np.asarray(image, np.uint8)[::-1]),
             float(said["resolution"]),
-            tuple(float(v) for v in origin),  # type: ignore[arg-type]
+            tuple(float(v) for v in said["origin"]),  # type: ignore[arg-type]
             said.get("mode", "trinary"),
             float(said.get("occupied_thresh", 0.65)),
             float(said.get("free_thresh", 0.196)),
             bool(said.get("negate", False)),
             properties if isinstance(properties, dict) else {},
         )
+
+    def _picture(self, data: bytes, href: str, said: Mapping[str, Any]) -> Picture:
+        """A picture: its pixels, and the exact place that its overlay has in our words."""
+        image = _image.read_image(data, self.context.limits)
+        if image.mode not in ("L", "LA", "RGB", "RGBA"):
+            raise UnreadableFile(f"{href} is no longer the picture that was written: its colours have changed")
+        pixels = np.asarray(image, np.uint8).reshape(image.height, image.width, -1)
+        a, b, c, d, e, f = (float(v) for v in said["transform"])
+        properties = said.get("properties")
+        own = properties if isinstance(properties, dict) else {}
+        return Picture(np.ascontiguousarray(pixels), (a, b, c, d, e, f), str(said["crs"]), own)
 
     def _remove_ours(self, root: etree._Element, ours: list[tuple[etree._Element, dict[str, str]]]) -> bool:
         """Take out our folders and styles; True where nothing of anybody else is left in the file."""
@@ -726,11 +755,11 @@ class _Reader:
         root: etree._Element,
         items: list[_Item],
         parsed: Sequences,
-        name: str,
+        name: str | None,
         entry: str | None,
         level: str,
     ) -> None:
-        """Somebody's drawing: its items become objects, the rest of it the document."""
+        """Somebody's drawing: its items become objects, the rest of it the document. name: its key, if it has one."""
         geometry = _geometries(items, parsed)
         ids, titles = _identify(items, self.context)
         properties: list[dict[str, Any]] = []
@@ -739,7 +768,7 @@ class _Reader:
             title = titles[k]
             kind = "overlay" if local_name(item.element) in OVERLAYS else _KINDS[types[k]] or _mixed(geometry[k])
             own: dict[str, Any] = {"kind": kind}
-            kept: dict[str, Any] = {"document": name, "place": k}
+            kept: dict[str, Any] = {"place": k}
             if title is not None and title[1]:
                 own["name"] = title[1]
             for label, value in item.data:
@@ -750,14 +779,16 @@ class _Reader:
         self.columns.setdefault(level, []).append((ids, list(geometry), properties))
         documents = self.documents.setdefault(level, {})
         if self.context.whole:
-            documents[name] = {"xml": _keep_text(root, items, [t[0] if t else None for t in titles], properties)}
-            if entry is not None:
-                documents[name]["entry"] = entry
+            xml = _keep_text(root, items, [t[0] if t else None for t in titles], properties)
+            key = name or hashlib.sha256(f"{entry or ''}\0{xml}".encode()).hexdigest()[:DOCUMENT_KEY_DIGITS]
+            documents[key] = {"xml": xml} if entry is None else {"xml": xml, "entry": entry}
+            for own in properties:
+                own[FAMILY]["document"] = key
 
     # --- the result ---
 
     def layers(self) -> Layers:
-        parts: dict[PartKey, Part] = dict(self.grids)
+        parts: dict[PartKey, Part] = dict(self.rasters)
         for level, columns in self.columns.items():
             ids = unique_ids(i for c in columns for i in c[0])
             shapes = [g for c in columns for g in c[1]]
@@ -916,8 +947,13 @@ def _values(extended: etree._Element) -> list[tuple[str, etree._Element]]:
     return list(out.items())
 
 
-def _spoken(data: Iterable[tuple[str, etree._Element]]) -> Iterator[tuple[str, str]]:
-    return ((name, value.text or "") for name, value in data)
+def _words(data: Iterable[tuple[str, etree._Element]], names: frozenset[str]) -> dict[str, str]:
+    """The values by name as texts; of these names as they were before ``spell`` quoted what looks like a number."""
+    words = {name: value.text or "" for name, value in data}
+    for name in names & words.keys():
+        value = unspell(words[name])
+        words[name] = value if isinstance(value, str) else words[name]
+    return words
 
 
 def _plain_sequences(g: etree._Element) -> tuple[str, list[tuple[str, etree._Element]]] | None:

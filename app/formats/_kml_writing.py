@@ -5,6 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -18,6 +19,7 @@ import shapely
 from lxml import etree
 from numpy.typing import NDArray
 
+from app.errors import Invalid
 from app.formats import Needs, WriteContext, _image, _text
 from app.formats._kml import (
     COORDINATES,
@@ -38,9 +40,10 @@ from app.formats._kml import (
     spell,
 )
 from app.model.features import Features, Properties, concatenate, unique_ids
-from app.model.frame import GROUND
-from app.model.geodesy import LocalFrame
+from app.model.frame import GROUND, MAX_DATUM_LATITUDE, Datum
+from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
 from app.model.grid import OccupancyGrid
+from app.model.imagery import LOCAL, USUAL_COLOURS, Picture, displayed
 from app.model.layers import Layer, Layers, PartKey
 
 KML = "http://www.opengis.net/kml/2.2"
@@ -117,12 +120,11 @@ def write_kml(layers: Layers, context: WriteContext, *, with_pictures: bool, tak
             rest = _undrawn(part, drawn)
         if rest is not None:
             folders.append(_folder(key, rest, layers, frame, shared))
-    overlays, pictures = _grids(layers, context, with_pictures, taken)
+    overlays, pictures = _overlays(layers, context, with_pictures, taken)
     # A drawing that is all there is comes back as it was: the datum stands beside what is ours, not inside it.
     datum = [_datum(layers)] if folders or overlays or not documents else []
     ours = "".join([*datum, *folders, *overlays])
-    for layer in ("voxels", "imagery"):
-        context.drop(layer, len(layers.of(layer)), "KML has no place for it")
+    context.drop("voxels", len(layers.of("voxels")), "KML has no place for it")
     entry = documents[0].entry if len(documents) == 1 else None
     return Written((HEAD + _file(documents, ours, context)).encode(), pictures, entry)
 
@@ -396,52 +398,105 @@ def _local_words(part: Features) -> list[str]:
     return out
 
 
-def _grids(
+def _overlays(
     layers: Layers, context: WriteContext, with_pictures: bool, taken: frozenset[str]
 ) -> tuple[list[str], dict[str, bytes]]:
-    """Each grid as a GroundOverlay at its place, with all that its picture does not say, and the pictures."""
+    """Each grid and picture as a GroundOverlay at its place, with all that its image does not say, and the images."""
     out: list[str] = []
-    pictures: dict[str, bytes] = {}
-    for key, grid in layers.grids().items():
+    images: dict[str, bytes] = {}
+    kept: Counter[str] = Counter()
+    for key, part in layers.parts.items():
+        if not isinstance(part, OccupancyGrid | Picture):
+            continue
+        corners = _corners(key, part, layers, context)
+        if corners is None:
+            continue
         label = key.name if key.level == GROUND else f"{key.level}-{key.name}"
-        stem = re.sub(r"[^\w.-]+", "_", label).strip(".") or "grid"
+        stem = re.sub(r"[^\w.-]+", "_", label).strip(".") or key.layer
         name, n = f"{stem}.png", 2
-        while name in taken or name in pictures:
+        while name in taken or name in images:
             name, n = f"{stem}-{n}.png", n + 1
-        pictures[name] = _image.overlay_png(grid) if with_pictures else b""
-        out.append(_overlay(key, grid, name, layers))
-    if out and not with_pictures:
-        context.drop("occupancy", len(out), "the pictures of grids travel in KMZ only; KML tells where they lie")
-    return out, pictures if with_pictures else {}
+        images[name] = _png(key, part, context) if with_pictures else b""
+        out.append(_overlay(key, part, name, corners))
+        kept[key.layer] += 1
+    for layer, count in sorted(kept.items() if not with_pictures else ()):
+        why = "their images travel in KMZ, or beside the KML with pictures=true; without them it tells where they lie"
+        context.drop(layer, count, why)
+    return out, images if with_pictures else {}
 
 
-def _overlay(key: PartKey, grid: OccupancyGrid, href: str, layers: Layers) -> str:
-    """Where a grid lies: a box and its rotation (exact to the box's own flatness), and the exact corners."""
-    frame = layers.frame
-    corners = grid.corners()
-    shape = np.array([shapely.polygons(corners)], object)
-    part = Features((key.name,), shape, ({},), np.ones(1, bool))
-    ring = shapely.get_coordinates(part.in_wgs84(frame))[:4]
-    turn, north, south, east, west = 0.0, *_box(ring)
-    if frame is not None:
-        heading = math.radians(frame.datum.heading)
-        middle = corners.mean(axis=0)
-        u, v = np.array([math.cos(heading), math.sin(heading)]), np.array([-math.sin(heading), math.cos(heading)])
-        w, h = grid.width * grid.resolution / 2, grid.height * grid.resolution / 2
-        sides = frame.to_wgs84(np.array([middle + w * u, middle - w * u, middle + h * v, middle - h * v]))
-        east, west, north, south = sides[0, 0], sides[1, 0], sides[2, 1], sides[3, 1]
-        turn = (math.degrees(grid.origin[2]) - frame.datum.heading + 180.0) % 360.0 - 180.0
-    words = {
-        "resolution": grid.resolution,
-        "origin": list(grid.origin),
-        "mode": grid.mode,
-        "occupied_thresh": grid.occupied_thresh,
-        "free_thresh": grid.free_thresh,
-        "negate": grid.negate,
-        "size": [grid.width, grid.height],
-    }
-    if grid.properties:
-        words["properties"] = dict(grid.properties)
+def _corners(
+    key: PartKey, part: OccupancyGrid | Picture, layers: Layers, context: WriteContext
+) -> NDArray[np.float64] | None:
+    """The lower left, lower right, upper right and upper left corner of an image, (longitude, latitude); None, with
+    the reason in the report, where KML has no place for it."""
+    if isinstance(part, OccupancyGrid):
+        shape = np.array([shapely.polygons(part.corners())], object)
+        local = Features((key.name,), shape, ({},), np.ones(1, bool))
+        return np.asarray(shapely.get_coordinates(local.in_wgs84(layers.frame))[:4], np.float64)
+    corners = part.outline()[[3, 2, 1, 0]]
+    problem = ""
+    if part.crs != LOCAL:
+        try:
+            corners = crs_to_wgs84(part.crs, np.column_stack([corners, np.zeros(4)]))[:, :2]
+        except Invalid as error:
+            problem = error.detail
+    elif layers.frame is None:
+        problem = "it lies in local metres, and there is no datum"
+    else:
+        corners = layers.frame.to_wgs84(corners)
+    if not problem and not (np.isfinite(corners).all() and (np.abs(corners) <= [180.0, 90.0]).all()):
+        problem = "its corners are not on earth"
+    if not problem and abs(corners[:, 1].mean()) > MAX_DATUM_LATITUDE:
+        problem = f"it lies beyond ±{MAX_DATUM_LATITUDE:g} degrees of latitude"
+    if not problem and np.ptp(corners[:, 0]) > 180.0:
+        problem = "it crosses the antimeridian, and an overlay cannot"
+    context.drop(f"imagery {key.level}/{key.name}", int(bool(problem)), f"it cannot be placed: {problem}")
+    return None if problem else corners
+
+
+def _png(key: PartKey, part: OccupancyGrid | Picture, context: WriteContext) -> bytes:
+    if isinstance(part, OccupancyGrid):
+        return _image.overlay_png(part)
+    if not _is_shown_as_it_is(part):
+        why = "an overlay's image has 8-bit grey or colours: bands, values and palettes beyond them are drawn as shown"
+        context.drop(f"imagery {key.level}/{key.name}: pixel values", 1, why)
+    return _image.encode_png(displayed(part))
+
+
+def _is_shown_as_it_is(picture: Picture) -> bool:
+    """Whether a PNG holds the picture's very pixels."""
+    plain = picture.pixels.dtype == np.uint8 and picture.colours == USUAL_COLOURS.get(len(picture.colours))
+    return plain and picture.nodata is None
+
+
+def _overlay(key: PartKey, part: OccupancyGrid | Picture, href: str, ring: NDArray[np.float64]) -> str:
+    """Where an image lies: a box and its rotation (exact to the box's own flatness), and the exact corners."""
+    longitude, latitude = ring.mean(axis=0).tolist()
+    frame = local_frame(Datum(latitude, longitude))
+    metres = frame.to_local(ring)
+    right, up = metres[1] + metres[2] - metres[0] - metres[3], metres[2] + metres[3] - metres[0] - metres[1]
+    w, h = np.hypot(*right) / 4, np.hypot(*up) / 4
+    sides = frame.to_wgs84(metres.mean(axis=0) + np.array([[w, 0.0], [-w, 0.0], [0.0, h], [0.0, -h]]))
+    east, west, north, south = sides[0, 0], sides[1, 0], sides[2, 1], sides[3, 1]
+    turn = round(math.degrees(math.atan2(right[1], right[0])), 9) + 0.0
+    words: dict[str, Any]
+    if isinstance(part, OccupancyGrid):
+        words = {
+            "resolution": part.resolution,
+            "origin": list(part.origin),
+            "mode": part.mode,
+            "occupied_thresh": part.occupied_thresh,
+            "free_thresh": part.free_thresh,
+            "negate": part.negate,
+            "size": [part.width, part.height],
+        }
+    else:
+        words = {"crs": part.crs, "transform": list(part.transform)}
+    if part.properties:
+        own = part.properties
+        plain = isinstance(part, OccupancyGrid) or _is_shown_as_it_is(part)
+        words["properties"] = dict(own) if plain else {k: v for k, v in own.items() if k == "attribution"}
     told = _place_words(key) + "".join(_data(n, v) for n, v in words.items())
     box = zip(("north", "south", "east", "west", "rotation"), (north, south, east, west, turn), strict=True)
     sides_text = "".join(f"<{n}>{_text.number(v, _text.DEGREES)}</{n}>" for n, v in box if n != "rotation" or v)
@@ -453,18 +508,13 @@ def _overlay(key: PartKey, grid: OccupancyGrid, href: str, layers: Layers) -> st
     )
 
 
-def _box(ring: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    west, south = ring.min(axis=0)
-    east, north = ring.max(axis=0)
-    return north, south, east, west
-
-
 # --- drawings ---------------------------------------------------------------------------------------------------------
 
 _ITEMS = re.compile(r"<\?items ([0-9]+)\?>")
 _PREFIX = re.compile(r"[<\s]/?([\w.-]+):[\w.-]+(?=[\s=>/])")
 _DECLARED = re.compile(r"xmlns:([\w.-]+)=")
 _ROOT = re.compile(r"<((?:[\w.-]+:)?([\w.-]+))((?:\s[^>]*?)?)(/?)>")
+_TITLE = re.compile(r"<(?:[\w.-]+:)?name>([^<]*)</")
 _XMLNS = re.compile(r"""\sxmlns(?::[\w.-]+)?="[^"]*\"""")
 
 
@@ -736,7 +786,8 @@ def _wrapped(document: _Document, xml: str) -> str:
     if root and root[2] == "kml":
         xml = "" if root[4] else xml[root.end() : xml.rindex("<")]
     default = "" if ' xmlns="' in declarations else f' xmlns="{KML}"'
-    shown = escape(document.name.rpartition("/")[2])
+    title = _TITLE.search(xml)
+    shown = title[1] if title and title[1].strip() else "drawing"
     return (
         f'<Document{default}{declarations}><name>{shown}</name><ExtendedData xmlns="{KML}">{words}</ExtendedData>'
         f"{xml}</Document>\n"

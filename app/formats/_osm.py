@@ -31,19 +31,28 @@ Tags = dict[str, str]
 
 INT64 = 2**63
 
-EXTRAS = frozenset({"note", "meta", "remark", "MetaInfo"})
-"""Elements beside the data that Overpass and Autoware's editor write. Any other is refused, as osmcode's tests ask."""
+EXTRAS = frozenset({"note", "meta", "remark", "MetaInfo", "changeset"})
+"""Elements beside the data that Overpass, JOSM and Autoware's editor write. Any other is refused, as osmcode's tests
+ask."""
+
+DATA = frozenset({"node", "way", "relation"})
+
+MAX_UNKNOWN_DEPTH = 8
+"""Levels of unknown elements inside each other."""
+
+Unknown = list[Any]
+"""An element that is kept as it is: [name, attributes, text, elements in it], without empty ones at the end."""
 
 
 @dataclass(slots=True)
 class Way:
-    """A way: its nodes by id, in order. children: elements that OSM does not know, as (name, attributes)."""
+    """A way: its nodes by id, in order. children: elements that OSM does not know."""
 
     id: int
     refs: list[int]
     tags: Tags
     attributes: Attributes
-    children: list[tuple[str, Attributes]] = field(default_factory=list)
+    children: list[Unknown] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -54,7 +63,7 @@ class Relation:
     members: list[tuple[str, int, str]]
     tags: Tags
     attributes: Attributes
-    children: list[tuple[str, Attributes]] = field(default_factory=list)
+    children: list[Unknown] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -74,8 +83,8 @@ class Data:
     relations: list[Relation]
     root: Attributes
     bounds: list[Attributes]
-    elements: list[tuple[str, Attributes, str]]
-    node_children: dict[int, list[tuple[str, Attributes]]] = field(default_factory=dict)
+    elements: list[Unknown]
+    node_children: dict[int, list[Unknown]] = field(default_factory=dict)
     problems: list[tuple[str, int | None, str]] = field(default_factory=list)
 
 
@@ -443,7 +452,7 @@ class _Careful:
         self.limits = limits
         self.root: Attributes = {}
         self.bounds: list[Attributes] = []
-        self.elements: list[tuple[str, Attributes, str]] = []
+        self.elements: list[Unknown] = []
         self.ids: list[int] = []
         self.lonlat: list[tuple[float, float]] = []
         self.lines: list[int] = []
@@ -452,7 +461,7 @@ class _Careful:
         self.shared: dict[tuple[tuple[str, str], ...], Attributes] = {}
         self.ways: list[Way] = []
         self.relations: list[Relation] = []
-        self.node_children: dict[int, list[tuple[str, Attributes]]] = {}
+        self.node_children: dict[int, list[Unknown]] = {}
         self.problems: list[tuple[str, int | None, str]] = []
 
     def begin(self, root: etree._Element) -> None:
@@ -463,7 +472,7 @@ class _Careful:
         self.root = self.attributes(root)
 
     def check_name(self, element: etree._Element) -> None:
-        if element.tag not in ("node", "way", "relation", "bounds", "bound") and element.tag not in EXTRAS:
+        if element.tag not in DATA | EXTRAS | {"bounds", "bound"}:
             _refuse(f"<{element.tag}> is no element of an OSM file", element)
 
     def attributes(self, element: etree._Element) -> Attributes:
@@ -479,13 +488,14 @@ class _Careful:
             self.bounds.append(attributes)
             return
         if element.tag in EXTRAS:
-            self.elements.append((element.tag, attributes, (element.text or "").strip()))
+            row = self.unknown(element)
+            self.elements.append([*row, ""] if len(row) == 2 else row)
             return
         identity = _integer(attributes.pop("id", None), element, "id")
         tags: Tags = {}
         refs: list[int] = []
         members: list[tuple[str, int, str]] = []
-        children: list[tuple[str, Attributes]] = []
+        children: list[Unknown] = []
         for child in element:
             said = self.attributes(child)
             if child.tag == "tag" and "k" in said:
@@ -500,10 +510,8 @@ class _Careful:
                     _refuse(f"a member's type must be node, way or relation, not {kind!r}", child)
                 members.append((kind, _integer(said.get("ref"), child, "ref"), said.get("role", "")))
             else:
-                if len(child):
-                    _refuse(f"<{child.tag}> inside <{element.tag}> is no part of an OSM file", child)
+                children.append(self.unknown(child))
                 self.warn(f"<{child.tag}> inside <{element.tag}> is not known to OSM", child, element, identity)
-                children.append((str(child.tag), said))
         if element.tag == "node":
             self.node(element, identity, attributes, tags, children)
         elif element.tag == "way":
@@ -513,13 +521,23 @@ class _Careful:
         if len(self.ids) + len(self.ways) + len(self.relations) > self.limits.features:
             raise TooLarge(f"the file has more than {self.limits.features} elements, which is the limit")
 
+    def unknown(self, element: etree._Element, depth: int = 1) -> Unknown:
+        """An element as it stands, and those in it. Data inside other data is refused."""
+        if (element.tag in DATA and len(element)) or depth > MAX_UNKNOWN_DEPTH:
+            _refuse(f"<{element.tag}> inside <{element.getparent().tag}> is no part of an OSM file", element)
+        inner = [self.unknown(child, depth + 1) for child in element]
+        row: Unknown = [str(element.tag), self.attributes(element), (element.text or "").strip(), inner]
+        while not row[-1] and len(row) > 2:
+            row.pop()
+        return row
+
     def node(
         self,
         element: etree._Element,
         identity: int,
         attributes: Attributes,
         tags: Tags,
-        children: list[tuple[str, Attributes]],
+        children: list[Unknown],
     ) -> None:
         lat, lon = attributes.get("lat", ""), attributes.get("lon", "")
         if lat and lon:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Any
 
-from app.formats._osm import INT64
+from app.formats._osm import INT64, MAX_UNKNOWN_DEPTH
 from app.formats._text import DEGREES, numbers
 
 SHARED = 4096
@@ -41,8 +41,16 @@ class Node:
     vertex: bool = False
 
 
+Children = Mapping[tuple[str, int], Any]
+"""Elements that OSM does not know, by the type and id of the one that they stand in (see ``element_lines``)."""
+
+
 def document(
-    head: Iterable[str], nodes: Mapping[int, Node], ways: Mapping[int, Way], relations: Mapping[int, Relation]
+    head: Iterable[str],
+    nodes: Mapping[int, Node],
+    ways: Mapping[int, Way],
+    relations: Mapping[int, Relation],
+    children: Children,
 ) -> bytes:
     """The file: the lines of ``head`` (the root element first), then nodes, ways and relations, each by id.
 
@@ -50,7 +58,7 @@ def document(
     """
     done = BytesIO()  # whose content is taken out without a copy
     lines: list[str] = []
-    for line in _lines(head, nodes, ways, relations):
+    for line in _lines(head, nodes, ways, relations, children):
         lines.append(line)
         if len(lines) == LINES:
             lines.append("")
@@ -61,7 +69,11 @@ def document(
 
 
 def _lines(
-    head: Iterable[str], nodes: Mapping[int, Node], ways: Mapping[int, Way], relations: Mapping[int, Relation]
+    head: Iterable[str],
+    nodes: Mapping[int, Node],
+    ways: Mapping[int, Way],
+    relations: Mapping[int, Relation],
+    children: Children,
 ) -> Iterator[str]:
     cache: dict[int, str] = {}
 
@@ -76,6 +88,9 @@ def _lines(
             known = cache[id(said)] = attribute_text(said, RESERVED)
         return known
 
+    def unknown(kind: str, i: int) -> list[str]:
+        return element_lines(children[kind, i], "  ") if (kind, i) in children else []
+
     yield '<?xml version="1.0" encoding="UTF-8"?>'
     yield from head
     order = sorted(nodes, key=rank)
@@ -84,42 +99,58 @@ def _lines(
     for i, x, y in zip(order, lon, lat, strict=True):
         node = nodes[i]
         place = f' lat="{y}" lon="{x}"' if x is not None else ""
-        if node.tags:
+        further = unknown("node", i) if children else ()
+        if node.tags or further:
             yield f' <node id="{i}"{attributes(node.attributes)}{place}>'
             yield from tag_lines(node.tags)
+            yield from further
             yield " </node>"
         else:
             yield f' <node id="{i}"{attributes(node.attributes)}{place}/>'
     for i in sorted(ways, key=rank):
         refs, tags, said = ways[i]
-        if not refs and not tags:
+        further = unknown("way", i)
+        if not refs and not tags and not further:
             yield f' <way id="{i}"{attributes(said)}/>'
             continue
         yield f' <way id="{i}"{attributes(said)}>'
         yield from [f'  <nd ref="{r}"/>' for r in refs]
         yield from tag_lines(tags)
+        yield from further
         yield " </way>"
     for i in sorted(relations, key=rank):
         members, tags, said = relations[i]
-        if not members and not tags:
+        further = unknown("relation", i)
+        if not members and not tags and not further:
             yield f' <relation id="{i}"{attributes(said)}/>'
             continue
         yield f' <relation id="{i}"{attributes(said)}>'
         yield from [f'  <member type="{escape(t)}" ref="{r}" role="{escape(role)}"/>' for t, r, role in members]
         yield from tag_lines(tags)
+        yield from further
         yield " </relation>"
     yield "</osm>"
 
 
-def further_elements(rows: Any) -> list[str]:
-    """Lines for what stands beside the data (``note``, ``meta``, ``MetaInfo``): rows of [name, attributes, text]."""
+def element_lines(rows: Any, indent: str = " ", depth: int = 1) -> list[str]:
+    """Lines for elements that OSM does not know or that stand beside the data (``note``, ``meta``, ``changeset``).
+
+    rows: [name, attributes], then the text and a list of such rows where there are any. What is none is left out.
+    """
     lines = []
-    for row in rows if isinstance(rows, list) else []:
-        name, said, text = row if isinstance(row, list) and len(row) == 3 else ("", None, "")
-        if _NAME.fullmatch(str(name)):
-            inner = escape(str(text))
-            lines.append(f" <{name}{attribute_text(as_texts(said), frozenset())}>{inner}</{name}>")
+    for row in rows if isinstance(rows, list) and depth <= MAX_UNKNOWN_DEPTH else []:
+        name, said, text, inner = ([*row, "", []] if len(row) == 2 else [*row, []])[:4] if is_row(row) else ("",) * 4
+        if not _NAME.fullmatch(str(name)):
+            continue
+        start = f"{indent}<{name}{attribute_text(as_texts(said), frozenset())}>{escape(str(text))}"
+        below = element_lines(inner, f"{indent} ", depth + 1)
+        lines += [start, *below, f"{indent}</{name}>"] if below else [f"{start}</{name}>"]
     return lines
+
+
+def is_row(row: Any) -> bool:
+    """Whether this is an unknown element as it is stored."""
+    return isinstance(row, list) and 2 <= len(row) <= 4
 
 
 _ID = re.compile(r"([nwr])(-?\d{1,19})", re.ASCII)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from app.errors import Invalid, Problem, TooLarge, UnreadableFile
 from app.formats import Files, Limits, Parts, ReadContext, WriteContext
 from app.formats._choice import file_stem, the_one
-from app.model.frame import Datum
+from app.model.frame import MAX_DATUM_LATITUDE, Datum
 from app.model.geodesy import LocalFrame, crs_to_wgs84, local_frame
 from app.model.layers import MAP, Layers, Part, PartKey, Resources, cloud_name
 from app.model.voxels import DEPTH, HALF, LOG_ODDS, VoxelMap, expanded, morton
@@ -288,7 +288,7 @@ def _corner(earth: Array) -> Datum:
     """The south-west corner of (longitude, latitude), to a ten-millionth of a degree."""
     good = np.isfinite(earth[:, :2]).all(axis=1)
     west, south = np.floor(earth[good, :2].min(axis=0) * 1e7) / 1e7
-    return Datum(float(np.clip(south, -85.0, 85.0)), float(west))
+    return Datum(float(np.clip(south, -MAX_DATUM_LATITUDE, MAX_DATUM_LATITUDE)), float(west))
 
 
 def _fitted(low: Array, high: Array, options: ReadOptions, context: ReadContext) -> tuple[float, Move]:

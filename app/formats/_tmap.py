@@ -691,6 +691,7 @@ class _Writer:
             if self._is_plain(p, self.plain_node) and "orientation" not in p and p.get("name", name) == name:
                 self.filled["nodes"] += 1
                 self.filled["orientations"] += 1
+                self.filled["any yaw"] += 1
                 text = plain(said[i], _listed(edges.pop(i)), at)
             else:
                 text = self._node(p, name, said[i], at, edges.pop(i))
@@ -852,6 +853,9 @@ class _Writer:
         self.filled["orientations"] += quaternion is None
         fill = own is None or self.legacy
         self.filled["nodes"] += own is None if self.listed else fill
+        if fill or self.listed:
+            known = {**({} if self.listed else node), **_mapping_of(node.get("properties"))}
+            self.filled["any yaw" if quaternion is None else "yaw"] += "yaw_goal_tolerance" not in known
         key = ("node", quaternion is None, fill, orjson.dumps((rest, more)).decode() if rest or more else None)
         pieces = self.templates.get(key)
         if pieces is None:
@@ -938,14 +942,18 @@ class _Writer:
             where = f"{why}, where they have none"
             fill("nodes: verts", f"an octagon of {options.verts_radius:g} m", where, "verts_radius")
             fill("nodes: xy_goal_tolerance", options.xy_goal_tolerance, where, "xy_goal_tolerance")
-            turned = f"{why}, where they have an orientation"
-            fill("nodes: yaw_goal_tolerance", options.yaw_goal_tolerance, turned, "yaw_goal_tolerance")
             fill("nodes: localise_by_topic", options.localise_by_topic, why, "localise_by_topic")
             if isinstance(options, WriteOptions):
                 fill("nodes: parent_frame", options.parent_frame, why, "parent_frame")
                 fill("nodes: restrictions", options.restrictions, why, "restrictions")
             else:
                 fill("nodes: map, pointset", "the map's", why)
+        if filled["yaw"]:
+            why = f"{filled['yaw']} nodes with an orientation have none; in radians"
+            fill("nodes: yaw_goal_tolerance", options.yaw_goal_tolerance, why, "yaw_goal_tolerance")
+        if filled["any yaw"]:
+            why = f"{filled['any yaw']} nodes have none and no orientation, so that any will do; in radians"
+            fill("nodes without an orientation: yaw_goal_tolerance", ANY_YAW, why)
         if filled["orientations"]:
             fill("nodes: pose.orientation", [0.0, 0.0, 0.0, 1.0], f"{filled['orientations']} nodes have none")
         for what, count in sorted(self.dropped.items()):

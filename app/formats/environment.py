@@ -10,6 +10,9 @@ Robots source the two scripts, so they are made anew and never copied: literal v
 that are there; as in the template those of maps that are missing are empty. The archive holds what is stored;
 ``complete`` adds what derivations can make of it.
 
+``config/fleet_map`` holds the stored layers exactly (``_content``): a package whose maps nobody has touched gives back
+the very environment, and in one that was edited the maps count.
+
 Every map in it is another format's: reading is what an upload of the folder is (``app.bundle``), and writers come from
 ``WriteContext.make``.
 """
@@ -23,7 +26,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.errors import CannotConvert, FleetMapError, MissingLayer, Problem, UnreadableFile
-from app.formats import Files, Format, Inner, Needs, ReadContext, WriteContext, _archive, _shell, register
+from app.formats import Files, Format, Inner, Needs, ReadContext, WriteContext, _archive, _content, _shell, register
 from app.formats._network import some
 from app.model.features import Features
 from app.model.frame import GROUND, Level
@@ -114,6 +117,8 @@ class _Writer:
             raise MissingLayer("there is nothing to make an environment package of: supply a map of any kind")
         self.left_over()
         self.scripts(variables)
+        if self.context.stored is not None and not self.complete:  # else the maps say something else
+            self.out |= _content.pack(self.layers, self.out, self.context.stored)
         return {f"{CONFIG}/{path}": data for path, data in self.out.items()}
 
     # --- one map ---
@@ -461,6 +466,7 @@ register(
         write_options=WriteOptions,
         family=NAME,
         rank=70,
+        version=2,
         extensions=(".zip",),
         holds=True,
     )

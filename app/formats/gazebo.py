@@ -751,6 +751,7 @@ register(
             also=frozenset({"resources", "occupancy"}),
         ),
         family=NAME,
+        titled=True,
         rank=10,
     )
 )

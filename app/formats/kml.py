@@ -7,13 +7,27 @@ Source: OGC 12-007r2 (KML 2.3), Google's ``gx`` extension.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from xml.sax.saxutils import unescape
+
 from app.formats import Files, Format, ReadContext, WriteContext, _kml_rules, register
 from app.formats._archive import is_archive
 from app.formats._kml import FAMILY, MAIN, read_kml
 from app.formats._kml_writing import NEEDS, write_kml
 from app.model.layers import Layers
+from app.parameters import parameter
 
+_HREF = re.compile(rb"<href>([^<]+)</href>")
 _HEADS = (b"<kml", b":kml", b"opengis.net/kml", b"earth.google.com/kml")
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOptions:
+    """What is written beside the drawing."""
+
+    pictures: bool = parameter(False, "write the images of grids and pictures as files beside the KML")
 
 
 def detect(name: str, data: bytes) -> bool:
@@ -26,9 +40,20 @@ def detect(name: str, data: bytes) -> bool:
     return name.lower().endswith(".kml") or (b"<" in head[:16] and any(word in head for word in _HEADS))
 
 
+def companions(main: str, data: bytes, names: Sequence[str]) -> list[str]:
+    """The images of our own overlays, which lie beside the drawing."""
+    if b'"fleetmap"' not in data or b"<GroundOverlay" not in data:
+        return []
+    folder = main[: main.rfind("/") + 1]
+    wanted = {folder + unescape(href.decode("utf-8", "replace")) for href in _HREF.findall(data)}
+    return [name for name in names if name in wanted]
+
+
 def read(files: Files, context: ReadContext) -> Layers:
     """The objects of a drawing, or the layers that we once wrote into it."""
-    layers, _ = read_kml(files[context.main], context, context.main, {})
+    folder = context.main[: context.main.rfind("/") + 1]
+    images = {n.removeprefix(folder): d for n, d in files.items() if n.startswith(folder) and n != context.main}
+    layers, _ = read_kml(files[context.main], context, images)
     return layers
 
 
@@ -36,7 +61,9 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     """The drawings as they were uploaded, with everything else beside them in our own words."""
     files = sum(len(p.files) for k, p in layers.of("resources", name="kmz").items() if hasattr(p, "files"))
     context.drop("resources", files, "images and further files of a drawing travel in KMZ only")
-    return {MAIN: write_kml(layers, context, with_pictures=False, taken=frozenset()).kml}
+    pictures = isinstance(context.options, WriteOptions) and context.options.pictures
+    made = write_kml(layers, context, with_pictures=pictures, taken=frozenset())
+    return {MAIN: made.kml, **made.pictures}
 
 
 register(
@@ -45,7 +72,7 @@ register(
         title="KML",
         files=(MAIN,),
         media_types=("application/vnd.google-earth.kml+xml",),
-        carries=frozenset({"location", "objects", "topology", "zones", "occupancy"}),
+        carries=frozenset({"location", "objects", "topology", "zones", "occupancy", "imagery"}),
         detect=detect,
         read=read,
         check=_kml_rules.check,
@@ -55,6 +82,10 @@ register(
         marks_blocked=True,
         drawing=True,
         outlines=True,
+        titled=True,
+        version=2,
+        write_options=WriteOptions,
+        companions=companions,
         rank=10,
         extensions=(".kml",),
     )

@@ -1,10 +1,13 @@
 """KMZ: a KML file with its images in a ZIP archive.
 
 The main document is the first entry whose name ends in ``.kml``, in the archive's own order, as the reference reader
-takes it; every other entry is kept byte for byte. Grids travel here with their pictures and come back as grids.
+takes it; every other entry is kept byte for byte. Grids and pictures travel here as overlays
+with their images and come back as what they are.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, Format, ReadContext, WriteContext, _kml_rules, register
@@ -36,7 +39,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     entries = archive.unpack(files[context.main], context.limits)
     main = first_kml(entries)
     others = {name: body for name, body in entries.items() if name != main}
-    layers, used = read_kml(entries[main], context, context.main, others, main)
+    layers, used = read_kml(entries[main], context, others, main)
     kept = {name: body for name, body in others.items() if name not in used}
     parts: dict[PartKey, Part] = dict(layers.parts)
     if kept and context.wants("resources"):
@@ -76,15 +79,17 @@ register(
         title="KMZ (KML with its images)",
         files=(MAIN,),
         media_types=("application/vnd.google-earth.kmz",),
-        carries=frozenset({"location", "objects", "topology", "zones", "occupancy", "resources"}),
+        carries=frozenset({"location", "objects", "topology", "zones", "occupancy", "imagery", "resources"}),
         detect=detect,
         read=read,
         check=_kml_rules.check_archive,
         write=write,
-        needs=NEEDS,
+        needs=replace(NEEDS, one_of=(*NEEDS.one_of, frozenset({"imagery"}))),
         family=FAMILY,
         marks_blocked=True,
         drawing=True,
+        titled=True,
+        version=2,
         rank=11,
         extensions=(".kmz",),
     )

@@ -396,7 +396,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     if data.bounds:
         said["bounds"] = data.bounds
     if data.elements:
-        said["elements"] = [[name, attributes, text] for name, attributes, text in data.elements]
+        said["elements"] = data.elements
     for relation in data.relations:
         limit = relation.tags.get("speed_limit")
         speed = None if limit is None else speed_of(limit)
@@ -523,7 +523,7 @@ class _Reader:
             tags = data.tags.get(k, {})
             said = self.asked(k)
             if children := data.node_children.get(k):
-                said["children"] = [list(c) for c in children]
+                said["children"] = children
             properties.append(self.compact(_properties(said, tags, "point")))
         special_ids = {data.ids[k] for k in lone}
         deep = ~np.isnan(self.xyz[:, 2])
@@ -537,7 +537,7 @@ class _Reader:
             if r.attributes:
                 said["attributes"] = r.attributes
             if r.children:
-                said["children"] = [list(c) for c in r.children]
+                said["children"] = r.children
             ids.append(f"r{r.id}")
             geometry.append(NO_GEOMETRY)
             properties.append(self.compact(_properties(self.compact(said), r.tags, "relation")))
@@ -572,7 +572,7 @@ class _Reader:
         if any(mere):
             said["vertices"] = mere[0] if all(b == mere[0] for b in mere) else bends
         if way.children:
-            said["children"] = [list(c) for c in way.children]
+            said["children"] = way.children
         return self.compact(said)
 
     def bend(self, k: int) -> dict[str, Any]:
@@ -669,6 +669,7 @@ class _Writer:
         self.relations: dict[int, tuple[list[tuple[str, int, str]], Mapping[str, str], Mapping[str, str]]] = {}
         self.levels: dict[str, _Level] = {}
         self.lost: Counter[str] = Counter()
+        self.children: dict[tuple[str, int], Any] = {}
         self.explained: dict[PartKey, set[str]] = {}
         self.moved: dict[PartKey, set[str]] = {}
         mine = [part for key, part in layers.vector("objects").items() if key.name == NAME]
@@ -740,14 +741,14 @@ class _Writer:
             tags = {k: v for k, v in tags.items() if k != NODE}
         self.points[new] = _Point(xyz, local, tags, as_texts(said.get("attributes")), _pair(said.get("at")))
         level.nodes[i] = new
-        self.children(said)
+        self.unknown("node", new, said)
 
     def way(self, level: _Level, i: int, shape: Any, said: Mapping[str, Any], local: bool) -> bool:
         """Write a way; False where its geometry no longer has the points that it came with."""
         refs = integers(said.get("refs"))
         at = _course(shape)
         new = level.ways[i] = self.fresh() if i in self.ways else i
-        self.children(said)
+        self.unknown("way", new, said)
         tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
         missing = set(integers(said.get("missing")) or ())
         if refs is None or len(refs) - len(missing) != len(at):
@@ -790,9 +791,10 @@ class _Writer:
             out.append(known[place[:2]])
         return out
 
-    def children(self, said: Mapping[str, Any]) -> None:
-        if isinstance(said.get("children"), list):
-            self.lost["elements that OSM does not know"] += len(said["children"])
+    def unknown(self, what: str, number: int, said: Mapping[str, Any]) -> None:
+        """Keep the elements inside an element that OSM does not know."""
+        if said.get("children"):
+            self.children[what, number] = said["children"]
 
     def lanelets(
         self,
@@ -923,7 +925,7 @@ class _Writer:
         self.lost["relation members that are not [type, id, role]"] += (
             len(stated) - len(members) if isinstance(stated, list) else 0
         )
-        self.children(said)
+        self.unknown("relation", level.relations[i], said)
         tags = tags or as_texts(said.get("tags"))
         self.relations[level.relations[i]] = (members, tags, as_texts(said.get("attributes")))
 
@@ -1203,7 +1205,7 @@ class _Writer:
             self.context.drop(what, times, "a Lanelet2 map has no place for them")
         if self.layers.datum is not None:
             self.context.drop("datum", 1, "a Lanelet2 map stands on earth and has no local frame of its own")
-        return _osm_text.document(self.head(), nodes, self.ways, self.relations)
+        return _osm_text.document(self.head(), nodes, self.ways, self.relations, self.children)
 
     def placed_nodes(self) -> dict[int, _osm_text.Node]:
         """All points in degrees with their tags."""
@@ -1247,7 +1249,7 @@ class _Writer:
             root["attribution"] = "; ".join(self.context.attribution)
         lines = [f"<osm{attribute_text(root, frozenset())}>"]
         for one in self.documents:
-            lines += _osm_text.further_elements(one.get("elements"))
+            lines += _osm_text.element_lines(one.get("elements"))
             boxes = one.get("bounds")
             lines += [f" <bounds{attribute_text(as_texts(b), frozenset())}/>" for b in boxes or [] if as_texts(b)]
         return lines
@@ -1350,6 +1352,7 @@ register(
         write_options=WriteOptions,
         family=NAME,
         rank=36,
+        version=2,
         extensions=(".osm",),
         choose=choose,
     )

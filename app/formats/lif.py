@@ -806,6 +806,7 @@ register(
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=WriteOptions,
         family=NAME,
+        titled=True,
         rank=37,
         extensions=(".lif.json", ".lif", ".json"),
         choose=choose,

@@ -588,6 +588,7 @@ register(
         family=NAME,
         check=_nav2_route_rules.check,
         lacks=lacks,
+        titled=True,
         rank=36,
         extensions=(".geojson", ".json"),
         bends="foreign",

@@ -614,6 +614,7 @@ register(
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=WriteOptions,
         family=NAME,
+        titled=True,
         rank=35,
         extensions=(".yaml", ".yml"),
         bends="nodes",

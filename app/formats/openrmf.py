@@ -1310,6 +1310,7 @@ register(
         needs=Needs(one_of=(frozenset({"topology"}),), also=frozenset({"objects", "resources"})),
         companions=companions_of(_FILENAME),
         family=NAME,
+        titled=True,
         rank=40,
         write_options=_rmf.WriteOptions,
         extensions=(".building.yaml", ".yaml", ".yml"),

@@ -1,7 +1,8 @@
 """OpenStreetMap: XML (``.osm``, also ``.gz`` and ``.bz2``) and PBF in, XML out.
 
 Reading. Each node that a ``highway=*`` way uses is a topology node ``n<id>``, each segment of such a way a directed
-edge ``w<way>:<from>-<to>`` (a segment that the way repeats gets ``#2`` …), two where it may be used both ways. Tags and
+edge ``w<way>:<from>-<to>`` (a segment that the way repeats gets ``#2`` …), two where it may be used both ways; a way of
+one node twice that is tagged ``self_loop=yes`` is an edge from that node to itself. Tags and
 the further attributes (version, user, timestamp …) stay with nodes and edges in ``properties.osm``. Everything else is
 an object of the family ``osm``: tagged or lone nodes ``n<id>``, all ways ``w<id>`` (the highways too, so that they come
 back whole and in order) and relations ``r<id>``. Nodes that only bend a line are no objects: their ids and attributes
@@ -14,7 +15,7 @@ refs       (ways) node ids in order
 missing    (ways) indexes into refs of nodes without a place; the geometry has a vertex for each of the others
 vertices   (ways) attributes of the nodes that are no features: one mapping for all, or a list parallel to refs
 members    (relations) [type, id, role] in order
-children   elements that OSM does not know: [name, attributes]
+children   elements that OSM does not know: [name, attributes], then the text and a list of such where there are any
 ========== ============================================================================================================
 
 An object's kind is its main tag's key (``building``, ``barrier``, ``highway`` …), ``tree`` and ``water`` for what is
@@ -45,7 +46,7 @@ from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, Format, Limits, Needs, ReadContext, WriteContext, _osm_rules, _osm_text, _xml, register
-from app.formats._osm import INT64, Attributes, Data, Tags, Way, is_pbf, parse, unpack
+from app.formats._osm import INT64, Data, Tags, Way, is_pbf, parse, unpack
 from app.formats._osm_text import NOTHING, Node, as_texts, attribute_text, element_id, integers, plain
 from app.formats._text import DEGREES, numbers
 from app.model import osm_tags
@@ -225,14 +226,24 @@ class Edges:
     target: list[int] = field(default_factory=list)
 
 
+LOOP = "self_loop"
+"""The tag of ways that are an edge from a node to itself, ``yes``. Without it a node twice in a row is a mistake."""
+
+
+def is_loop(refs: Sequence[int], tags: Mapping[str, Any]) -> bool:
+    """Whether a way is an edge from a node to itself, and not a mistake in the data."""
+    return len(refs) == 2 and refs[0] == refs[1] and tags.get(LOOP) == "yes"
+
+
 def way_edges(way: int, refs: Sequence[int], tags: Mapping[str, Any], absent: Set[int]) -> Edges:
     """The edges that a way means: reader and writer must agree on them, ids included. absent: nodes without a place."""
     out = Edges()
     seen: dict[str, int] = {}
     which = direction(tags)
-    forward, backward = which != "backward", which != "forward"
+    loop = is_loop(refs, tags)
+    forward, backward = loop or which != "backward", not loop and which != "forward"
     for k, (a, b) in enumerate(pairwise(refs)):
-        if a == b or (absent and (a in absent or b in absent)):
+        if (a == b and not loop) or (absent and (a in absent or b in absent)):
             continue
         for wanted, p, q in ((forward, a, b), (backward, b, a)):
             if wanted:
@@ -295,7 +306,7 @@ def read(files: Files, context: ReadContext) -> Layers:
 def _check_version(data: Data, context: ReadContext) -> None:
     version = data.root.get("version")
     if version is None:
-        if not any(name == "MetaInfo" for name, _, _ in data.elements):
+        if not any(row[0] == "MetaInfo" for row in data.elements):
             reason = 'the <osm> element needs a version: version="0.6"'
             raise UnreadableFile(reason, [Problem(reason, line=1, where="<osm>")])
         context.warn('the <osm> element has no version; read as "0.6"', where="<osm>")
@@ -308,20 +319,19 @@ def _document(data: Data) -> dict[str, Any]:
     if data.bounds:
         said["bounds"] = data.bounds
     if data.elements:
-        said["elements"] = [[name, attributes, text] for name, attributes, text in data.elements]
+        said["elements"] = data.elements
     document: dict[str, Any] = {"osm": said}
     boxes = [box for box in map(_box, data.bounds) if box is not None]
     if boxes:
-        west, south, east, north = zip(*boxes, strict=True)
-        document["bounds"] = [min(west), min(south), max(east), max(north)]
+        document["bounds"] = list(_around(boxes))
     texts = [data.root[k] for k in ("copyright", "attribution", "license") if data.root.get(k)]
-    texts += [text for name, _, text in data.elements if name == "note" and text]
+    texts += [row[2] for row in data.elements if row[0] == "note" and row[2]]
     if texts:
         document["attribution"] = texts
     return document
 
 
-def _box(attributes: Attributes) -> tuple[float, float, float, float] | None:
+def _box(attributes: Mapping[str, str]) -> tuple[float, float, float, float] | None:
     """[west, south, east, north] of a ``<bounds>``, or of the older ``<bound box="s,w,n,e">``."""
     names = ("minlon", "minlat", "maxlon", "maxlat")
     if all(k in attributes for k in names):
@@ -377,7 +387,7 @@ class _Network:
 
     def _doubts(self, way: Way, context: ReadContext) -> None:
         where = f"way {way.id}"
-        if any(a == b for a, b in pairwise(way.refs)):
+        if not is_loop(way.refs, way.tags) and any(a == b for a, b in pairwise(way.refs)):
             context.warn("the way goes from a node to itself; that segment is no edge", where=where)
         said = str(way.tags.get("oneway", "no")).strip().lower()
         if said not in _FORWARD and said not in _BACKWARD and said not in _NO:
@@ -442,7 +452,7 @@ def _of_node(data: Data, k: int) -> dict[str, Any]:
         if attributes:
             said["attributes"] = attributes
     if children := data.node_children.get(k):
-        said["children"] = [list(c) for c in children]
+        said["children"] = children
     return said
 
 
@@ -495,7 +505,7 @@ def _objects(data: Data, network: _Network, context: ReadContext, document: Prop
         if vertices := _vertices(data, way.refs, index[begin:end].tolist(), features):
             said["vertices"] = vertices
         if way.children:
-            said["children"] = [list(c) for c in way.children]
+            said["children"] = way.children
         if not way.refs:
             context.warn("the way has no nodes", where=f"way {way.id}")
         properties.append(_properties(said, way.tags, "line"))
@@ -509,7 +519,7 @@ def _objects(data: Data, network: _Network, context: ReadContext, document: Prop
         if relation.attributes:
             said["attributes"] = relation.attributes
         if relation.children:
-            said["children"] = [list(c) for c in relation.children]
+            said["children"] = relation.children
         properties.append(_properties(said, relation.tags, "relation"))
     ids += [f"r{i}" for i in relations]
     nothing = np.full(len(relations), NO_GEOMETRY, object)
@@ -601,11 +611,17 @@ class _Writer:
         self.next = {"node": lowest - 1, "way": lowest - 1, "relation": lowest - 1}
         self.referenced = set(chain.from_iterable(refs))
         self.lost: dict[str, int] = {}
+        self.children: dict[tuple[str, int], Any] = {}
 
     def fresh(self, what: str) -> int:
         new = self.next[what]
         self.next[what] = new - 1
         return new
+
+    def unknown(self, what: str, number: int, said: Mapping[str, Any]) -> None:
+        """Keep the elements inside an element that OSM does not know."""
+        if said.get("children"):
+            self.children[what, number] = said["children"]
 
     def lose(self, what: str, times: int = 1) -> None:
         self.lost[what] = self.lost.get(what, 0) + times
@@ -674,6 +690,7 @@ class _Writer:
                 new = self.fresh("node")
             if isinstance(said, Mapping):
                 tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
+                self.unknown("node", new, said)
             else:
                 # A street node that went through another format is called by its id there: that is no name.
                 nameless = own and properties.get("name", i) == i
@@ -704,8 +721,7 @@ class _Writer:
             new = self.fresh("node")
         self.nodes[new] = Node(x, y, as_texts(said.get("tags")), as_texts(said.get("attributes")))
         level.moved[number] = new
-        if said.get("children"):
-            self.lose("elements that OSM does not know", len(said["children"]))
+        self.unknown("node", new, said)
 
     def way(self, level: _Level, number: int, geometry: Any, said: Mapping[str, Any]) -> bool:
         """Write an OSM way; False where its properties or its geometry are no longer those of one."""
@@ -714,8 +730,6 @@ class _Writer:
         if refs is None or at is None:
             return False
         tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
-        if said.get("children"):
-            self.lose("elements that OSM does not know", len(said["children"]))
         missing = set(integers(said.get("missing")) or ())
         first = self.fresh("way") if number in self.ways else number
         if level.has_network and "highway" in tags and not deleted(attributes):
@@ -729,7 +743,9 @@ class _Writer:
             nodes = self.bend(level, refs, at, missing, said.get("vertices"), range(begin, end))
             self.ways[new] = (nodes, said_tags, attributes if whole or not written else NOTHING)
             written.append(new)
-        if not written:
+        if written:
+            self.unknown("way", written[0], said)
+        else:
             self.lose("ways whose edges are no longer in the network")
         level.ways[number] = written
         return True
@@ -855,8 +871,7 @@ class _Writer:
                 members.append((kind, level.relations.get(i, i), role))
             else:
                 members.append((kind, i, role))
-        if said.get("children"):
-            self.lose("elements that OSM does not know", len(said["children"]))
+        self.unknown("relation", level.relations[number], said)
         tags, attributes = as_texts(said.get("tags")), as_texts(said.get("attributes"))
         self.relations[level.relations[number]] = (members, tags, attributes)
 
@@ -895,7 +910,9 @@ class _Writer:
                     course = chosen.in_wgs84(self.layers.frame)
                 nodes = [a, *self.inner(course[k] if course is not None else None), b]
                 sign = (*signs[k], twin)
-                if sign == state and line[-1] == a and len(line) + len(nodes) <= MOST_NODES:
+                if nodes == [a, a]:  # by itself: within a line it would be a node that stands twice
+                    self.ways[self.fresh("way")] = (nodes, {**dict(signs[k][1]), "oneway": "yes", LOOP: "yes"}, NOTHING)
+                elif sign == state and line[-1] == a and len(line) + len(nodes) <= MOST_NODES:
                     line += nodes[1:]
                 elif sign == state and twin and line[-1] == b and len(line) + len(nodes) <= MOST_NODES:
                     line += nodes[-2::-1]
@@ -1015,7 +1032,7 @@ class _Writer:
     def text(self) -> bytes:
         for what, times in sorted(self.lost.items()):
             self.context.drop(what, times, "OSM has no place for them")
-        return _osm_text.document(self.head(), self.nodes, self.ways, self.relations)
+        return _osm_text.document(self.head(), self.nodes, self.ways, self.relations, self.children)
 
     def head(self) -> list[str]:
         documents = [p.document for p in self.layers.parts.values() if isinstance(p, Features)]
@@ -1028,19 +1045,13 @@ class _Writer:
             root["attribution"] = "; ".join(self.context.attribution)
         lines = [f"<osm{attribute_text(root, frozenset())}>"]
         for one in said:
-            lines += _osm_text.further_elements(one.get("elements"))
+            lines += _osm_text.element_lines(one.get("elements"))
         boxes = [d["bounds"] for d in documents if _is_box(d.get("bounds"))]
         if not boxes:
             boxes = self.fence()
         if boxes:
-            west, south, east, north = zip(*boxes, strict=True)
-            texts = numbers(np.array([min(south), min(west), max(north), max(east)], np.float64), DEGREES)
-            names = ("minlat", "minlon", "maxlat", "maxlon")
-            box = {k: plain(v) for k, v in zip(names, texts, strict=True)}
             kept = [as_texts(b) for one in said for b in one.get("bounds") or []]
-            if len(kept) == 1 and all(k in box or k not in names for k in kept[0]):
-                box = {**{k: v for k, v in kept[0].items() if k != "box"}, **box}
-            lines.append(f" <bounds{attribute_text(box, frozenset())}/>")
+            lines += [f" <bounds{attribute_text(box, frozenset())}/>" for box in _bounds(kept, boxes)]
         return lines
 
     def fence(self) -> list[list[float]]:
@@ -1106,6 +1117,30 @@ def _simple(geometry: Any) -> list[Any]:
     return out
 
 
+def _bounds(kept: Sequence[Mapping[str, str]], boxes: Sequence[Sequence[float]]) -> Sequence[Mapping[str, str]]:
+    """The attributes of ``<bounds>``: those that were read, while they are still the box around these boxes, else of
+    that one box. What they say besides (their origin) stays with them."""
+    whole = _around(boxes)
+    try:
+        known = [box for one in kept if (box := _box(one)) is not None]
+    except (UnreadableFile, ValueError):  # edits can put anything there
+        known = []
+    if len(known) != len(kept) or not known or _around(known) != whole:
+        known, kept = [whole], kept if len(kept) == 1 else [NOTHING]
+    names = ("minlat", "minlon", "maxlat", "maxlon")
+    out = []
+    for one, (w, s, e, n) in zip(kept, known, strict=True):
+        texts = numbers(np.array([s, w, n, e], np.float64), DEGREES)
+        place = {k: plain(v) for k, v in zip(names, texts, strict=True)}
+        out.append({**{k: v for k, v in one.items() if k != "box"}, **place})
+    return out
+
+
+def _around(boxes: Sequence[Sequence[float]]) -> tuple[float, float, float, float]:
+    west, south, east, north = zip(*boxes, strict=True)
+    return min(west), min(south), max(east), max(north)
+
+
 def _is_box(value: Any) -> bool:
     return (
         isinstance(value, list | tuple)
@@ -1130,7 +1165,7 @@ register(
         needs=Needs(one_of=(frozenset({"objects"}), frozenset({"topology"})), anchor="wgs84"),
         family=FAMILY,
         rank=20,
-        version=2,
+        version=3,
         extensions=(".osm", "osm.xml", ".osm.gz", ".osm.bz2", ".pbf"),
     )
 )

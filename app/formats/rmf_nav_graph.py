@@ -834,6 +834,7 @@ register(
         write=write,
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local", also=frozenset({"objects"})),
         family=NAME,
+        titled=True,
         rank=30,
         write_options=_rmf.WriteOptions,
         extensions=(".yaml", ".yml"),

@@ -38,6 +38,7 @@ register(
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=_tmap.ListOptions,
         family=_tmap.NAME,
+        titled=True,
         rank=49,
         extensions=(".tmap",),
         choose=_tmap.choose,

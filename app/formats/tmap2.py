@@ -41,6 +41,7 @@ register(
         needs=Needs(one_of=(frozenset({"topology"}),), anchor="local"),
         write_options=_tmap.WriteOptions,
         family=_tmap.NAME,
+        titled=True,
         rank=50,
         extensions=(*NAMES, ".tmap"),
         choose=_tmap.choose,

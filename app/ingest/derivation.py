@@ -52,7 +52,7 @@ def prepare_derivation(
     """
     store = open_store(database_url, blob_dir)
     known = derive.all_derivations()[wish.method]
-    stored = {e.key: e for e in base.parts if e.count > 0 and e.key.layer != known.gives}
+    stored = {e.key: e for e in base.parts if e.count > 0 and e.key.layer != known.gives and not _is_drawn(e)}
     own = {e.key: e for e in base.parts if e.count > 0 and e.key.layer == known.gives}
     without: frozenset[str] = frozenset({wish.method})
     failed: list[str] = []
@@ -94,6 +94,11 @@ def prepare_derivation(
     told = [Problem(f"left out: {d['count']} {d['what']}: {d['why']}") for d in notes.dropped]
     told += [Problem(f"filled in: {t['what']} = {t['value']}: {t['why']}") for t in notes.template]
     return store.prepare(base, Changes(operations)), (*notes.warnings, *told)
+
+
+def _is_drawn(entry: PartEntry) -> bool:
+    """Whether a part was made for people to look at, so that it is no evidence."""
+    return not entry.provenance.edited and derive.is_drawn(entry.provenance.steps)
 
 
 def _steps(

@@ -13,7 +13,7 @@ from app.bundle import Hints
 from app.convert import offline
 from app.derive import Notes, derives
 from app.errors import CannotConvert, CannotDerive, Invalid, MissingLayer
-from app.model.grid import FREE, OccupancyGrid
+from app.model.grid import FREE, OCCUPIED, OccupancyGrid
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
 from tests.api.conftest import Api
@@ -48,6 +48,7 @@ def blank(monkeypatch: pytest.MonkeyPatch) -> None:
         notes.warn("it is blank")
         notes.drop("objects", 1, "a blank grid shows none")
         cells = np.full((parameters.side, parameters.side), FREE, np.uint8)
+        cells[0, 0] = OCCUPIED
         return Layers({PartKey("occupancy"): OccupancyGrid(cells, 0.5)}, layers.datum, layers.levels)
 
     @derives(gives="occupancy", needs={"objects"}, parameters=Nothing, cost=1.0)

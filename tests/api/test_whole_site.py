@@ -107,6 +107,27 @@ def test_manifest_lists_both_levels_and_masks_of_office(api: Api, office: str) -
     check_files(api, office, body)
 
 
+def test_an_environment_uploaded_again_as_its_package_has_the_same_root(
+    api: Api, office: str, polytunnels: str, fresh: Callable[[], str], shared: Path
+) -> None:
+    template = shared / "data" / "environment_template" / "riseholme_park_farm_vineyard"
+    real = fresh()
+    api.post("environments", {"name": real})
+    api.upload(real, {p.relative_to(template).as_posix(): p.read_bytes() for p in template.rglob("*") if p.is_file()})
+    for name in (office, polytunnels, real):
+        package = api.get(f"environments/{name}/versions/latest/maps/environment").content
+        copy = fresh()
+        api.post("environments", {"name": copy})
+        made = api.upload(copy, {"environment.zip": package}).json()
+        before = api.get(f"environments/{name}/versions/latest").json()
+        assert made["root"] == before["root"]
+        assert made["warnings"] == []
+        for env in (name, copy):
+            network = yaml.safe_load(api.get(f"/maps/{env}/tmap2/network.tmap2.yaml").content)
+            said = {network[key] for key in ("name", "metric_map", "pointset")}
+            assert said == {env} if name != real else "riseholme" in network["name"], "an uploaded one keeps its own"
+
+
 def test_manifest_lists_drawn_masks_of_polytunnels(api: Api, polytunnels: str) -> None:
     body = listed(api, polytunnels, "occupancy_grid")
     assert {"map.pgm", "keepout.pgm", "keepout_filter_info.yaml", "speed.pgm"} <= set(names_of(body))

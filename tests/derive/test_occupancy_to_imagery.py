@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,18 @@ import pytest
 import shapely
 
 from app import derive
+from app.convert.make import from_layers
+from app.convert.recipe import recipe
 from app.derive import Notes
 from app.derive import occupancy_to_imagery as plan
-from app.errors import Ambiguous, CannotConvert
+from app.errors import Ambiguous, CannotConvert, MissingLayer
+from app.formats import get_format
 from app.model.features import features
-from app.model.frame import GROUND
+from app.model.frame import GROUND, Level
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.imagery import Picture, placed
 from app.model.layers import Layer, Layers, PartKey
+from app.store.values import PartEntry, Provenance, Version
 
 GRID = PartKey("occupancy")
 PLAN = PartKey("imagery", GROUND, "plan")
@@ -121,3 +126,30 @@ def test_nothing_is_derived_from_a_drawn_plan() -> None:
     assert derive.plan(have, frozenset({"imagery"})) is not None
     way = derive.plan(have, frozenset({"objects"}), without=frozenset({"occupancy_to_objects"}))
     assert way is None or all(step.name != "occupancy_to_imagery" for step in way.steps)
+
+
+def test_a_stored_plan_is_no_evidence_either() -> None:
+    """Neither what was drawn from a grid nor a blank grid is a source of other layers; an edited one is."""
+    now = datetime.fromtimestamp(0, UTC)
+
+    def version(information: Any, edited: bool = False) -> Version:
+        steps = ({"step": "occupancy_to_imagery"},)
+        source = Provenance(information, steps=steps, inputs=({},))
+        source = source.marked() if edited else source
+        part = PartEntry(PartKey("imagery", name="plan"), "00", 1, {}, source)
+        return Version("e", 1, "", None, "", "", now, {}, (), (), None, (Level(),), (part,))
+
+    for fmt in ("geojson", "tmap2", "octomap"):
+        with pytest.raises(MissingLayer, match="supply"):
+            recipe(version("derived"), fmt, {})
+        assert recipe(version("derived", edited=True), fmt, {}).steps
+        assert recipe(version("raw"), "satellite", {}).steps == ()
+    assert recipe(version("derived"), "satellite", {}).steps == ()
+
+
+def test_a_derivation_that_finds_nothing_is_missing_and_says_what_to_supply() -> None:
+    empty = OccupancyGrid(np.full((4, 4), 255, np.uint8), 0.5)
+    told = Layers({PartKey("occupancy"): empty})
+    for fmt in ("octomap", "geojson", "tmap2"):
+        with pytest.raises(CannotConvert, match="supply"):
+            from_layers(get_format(fmt), told, {}, derived=True)

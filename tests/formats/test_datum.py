@@ -180,6 +180,7 @@ def test_a_datum_without_a_fence_is_served_and_read() -> None:
     served, told = write(Layers({}, Datum(10.0, 20.0)))
     assert yaml.safe_load(served)["gnss_fence"]["gnss_fence_coords"] == []
     assert "no fence" in told.warnings[0].problem
+    assert [p.problem for p in formats.check(FORMAT, {"datum.yaml": served}) if p.level == "error"] == []
     layers, context = read(served)
     assert datum(layers) == Datum(10.0, 20.0)
     assert len(site(layers)) == 0

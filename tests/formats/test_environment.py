@@ -6,13 +6,14 @@ import io
 import json
 import subprocess
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import orjson
 import pytest
 import shapely
 
@@ -26,8 +27,12 @@ from app.formats.environment import MAIN, detect
 from app.model.features import Features, features, from_columns
 from app.model.frame import Datum, Level
 from app.model.grid import OccupancyGrid
-from app.model.layers import Layers, Part, PartKey
+from app.model.imagery import Picture
+from app.model.layers import Layers, Part, PartKey, Resources
 from app.model.templates import NO_TEMPLATES
+from app.model.voxels import VoxelMap
+from app.store import parts as store_parts
+from app.store.tree import Draft
 
 FORMAT = get_format("environment")
 SAMPLE = (Path(__file__).resolve().parents[1] / "samples/environment/yard.zip").read_bytes()
@@ -45,6 +50,11 @@ def unzipped(data: bytes) -> dict[str, bytes]:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         assert archive.testzip() is None
         return {n: archive.read(n) for n in archive.namelist()}
+
+
+def maps_of(package: dict[str, bytes]) -> dict[str, bytes]:
+    """A package without the stored layers beside its maps."""
+    return {n: d for n, d in package.items() if not n.startswith("config/fleet_map/")}
 
 
 def folder(shared: Path, name: str) -> dict[str, bytes]:
@@ -178,7 +188,7 @@ def test_the_sample_is_detected_read_and_written_whole() -> None:
     assert not detect("a.zip", _archive.pack({"doc.kml": b"<kml/>"}))
     first = told({"yard.zip": SAMPLE}, "environment")
     made = offline({"yard.zip": SAMPLE}, "environment", hints=Hints("environment"))
-    second = told(made.files, "environment")
+    second = told(maps_of(unzipped(made.files[MAIN])), "environment")
     assert second.datum == first.datum
     assert second.parts.keys() == first.parts.keys()
     for key, part in first.parts.items():
@@ -209,7 +219,7 @@ def test_variables_come_back_as_they_are_and_never_run(tmp_path: Path) -> None:
         "NOGO_COSTMAP_YAML_FILE",
         "POI_FILE",
     }
-    again = told(made.files).parts[VARIABLES]
+    again = told(maps_of(inner)).parts[VARIABLES]
     assert isinstance(again, Features)
     assert again.document["environment"]["variables"] == {
         "ENVIRONMENT_COMMON_LATEST_RELEASE": "v1.0.1",
@@ -305,7 +315,7 @@ def test_a_missing_map_is_told_and_the_others_are_there() -> None:
         ("a_b", line, {"kind": "edge", "source": "a", "target": "b"}),
     ]
     inner, report = written(Layers({PartKey("topology", "ground", "network"): features(rows, "local")}))
-    assert inner.keys() == {
+    assert maps_of(inner).keys() == {
         f"config/{n}" for n in ("environment.sh", "properties.sh", "topological/network.tmap2.yaml")
     }
     assert any(w["problem"].startswith("no kml is in it: ") for w in report["warnings"])
@@ -328,7 +338,7 @@ def test_nothing_is_no_environment() -> None:
     with pytest.raises(MissingLayer, match="supply"):
         written(Layers())
     inner, _ = written(Layers({VARIABLES: variables_of({"FARM_NAME": "x"})}))
-    assert inner.keys() == {"config/environment.sh", "config/properties.sh"}
+    assert maps_of(inner).keys() == {"config/environment.sh", "config/properties.sh"}
     with pytest.raises(CannotConvert):
         formats.write(FORMAT, Layers({VARIABLES: variables_of({"A": "x"})}), WriteContext())
 
@@ -354,7 +364,7 @@ def test_odd_variables_are_left_out_and_told(tmp_path: Path) -> None:
 
 
 def test_a_new_writer_of_an_inner_map_makes_a_new_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    version: Any = SimpleNamespace(datum=None, levels=(), templates=NO_TEMPLATES, closures=None)
+    version: Any = SimpleNamespace(environment="e", datum=None, levels=(), templates=NO_TEMPLATES, closures=None)
     way = recipe.Chain((), ())
 
     def keys() -> list[str]:
@@ -382,6 +392,67 @@ def test_bad_packages_are_refused_with_file_and_reason() -> None:
         told({"a.bin": b"no archive"}, "environment")
     with pytest.raises(BadUpload):
         told({"a.zip": _archive.pack({"readme.txt": b"hello"})}, "environment")
+
+
+def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> None:
+    rows = [("7", shapely.Point(1 / 3, 2 / 3, 0.1), {"kind": "node", "note": [1, 1.0, None], "name": "Größe"})]
+    picture = Picture(np.arange(24, dtype=np.uint16).reshape(2, 4, 3), (0.1, 0, 0, 0, -0.1, 0), properties={"a": 1})
+    voxels = VoxelMap(0.1, np.array([16], np.uint8), np.array([7], np.uint64), np.array([0.5], np.float32))
+    parts: dict[PartKey, Part] = {
+        PartKey("topology", "2", "network"): features(rows, "local", {"site": {"x": [0.1]}}),
+        PartKey("location"): features([], "wgs84", {"datum": {"more": True}}),
+        PartKey("occupancy", "2", "nav"): grid(),
+        PartKey("imagery", "2", "plan"): picture,
+        PartKey("voxels", "ground", "scan"): voxels,
+        PartKey("resources", "ground", "generated"): Resources({"a/b.bin": b"1", "c": b"1"}),
+    }
+    layers = Layers(parts, DATUM, (Level(), Level("2", 3.1)))
+    files = written(layers)[0]
+    package = _archive.pack(files)
+    again = told({"a.zip": package})
+    assert again.warnings == []
+    assert (again.datum, again.levels) == (layers.datum, layers.levels)
+    assert hashes(again.parts) == hashes(parts)
+    assert hashes(told({"a.bin": package}, "environment").parts) == hashes(parts)
+
+    content = "config/fleet_map/content.json"
+    yaml_name = next(n for n in files if n.endswith("nav_2/map.yaml"))
+    key = PartKey("occupancy", "2", "nav")
+    credited = making.from_layers(FORMAT, layers, {}, derived=True, credit={key: ("© Somebody",)})
+    assert told(credited.files).credit(key) == ("© Somebody",)
+    edited = {**files, yaml_name: files[yaml_name].replace(b"resolution:", b"resolution:  ")}
+    for changed, reason in (
+        (edited, f"{yaml_name} was edited"),
+        ({**files, "config/location/more.kml": b"<kml/>"}, "config/location/more.kml was added"),
+        ({n: d for n, d in files.items() if n != yaml_name}, f"{yaml_name} was removed"),
+        ({**files, content: b'{"version": 9}'}, "its version is not 1"),
+    ):
+        other = told(changed)
+        assert [p.problem for p in other.warnings if p.file == content] == [
+            f"not used, the maps of the package count: {reason}"
+        ]
+        assert not any(use.used for name, use in other.files.items() if "/fleet_map/" in name)
+        assert hashes(other.parts) != hashes(parts)
+    assert "content.json" not in " ".join(written(layers, complete=True)[0])
+
+    top = orjson.loads(files[content])
+    array = next(part for part in top["parts"] if part["layer"] == "occupancy")["cells"]
+    damaged: list[Any] = [{**top, "parts": [{"layer": "x"}]}, {**top, "levels": 3}, {**top, "datum": {"latitude": 89}}]
+    damaged += [{**top, "parts": [{**part, "ids": ["a", "a"]} for part in top["parts"]]}]
+    damaged += [{**top, "parts": [{**part, "properties": 5} for part in top["parts"]]}]
+    for wrong in ({"shape": [-1, 2]}, {"shape": [2**40, 2**20]}, {"type": "|O"}, {"file": "../x"}):
+        parts_ = [p | {"cells": array | wrong} if p["layer"] == "occupancy" else p for p in top["parts"]]
+        damaged.append({**top, "parts": parts_})
+    for wrong in (b"{", b"[]" * 10**5, *map(orjson.dumps, damaged)):
+        with pytest.raises(BadUpload) as caught:
+            told({**files, content: wrong})
+        assert [p.file for p in caught.value.problems] == [content], wrong[:100]
+
+
+def hashes(parts: Mapping[PartKey, Part]) -> dict[PartKey, bytes]:
+    """What the store would call these parts."""
+    made = {key: store_parts.compose(Draft(lambda _: {}), part, None, "") for key, part in parts.items()}
+    return {key: part.hash for key, part in made.items() if part is not None}
 
 
 def test_packages_in_packages_are_opened_once() -> None:

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
+from typing import Any
 
 import pytest
+import shapely
 
 from app import formats
 from app.bundle import Hints, Known, read, unpack
 from app.convert import offline
+from app.convert.make import from_layers
 from app.errors import BadUpload, CannotConvert, Invalid, MissingLayer
 from app.formats import Limits
+from app.model.features import features
 from app.model.frame import Datum
-from app.model.layers import LAYERS, Layers
+from app.model.layers import LAYERS, Layers, PartKey
+from app.store import parts
+from app.store.tree import Draft
 
 SAMPLES = Path(__file__).resolve().parents[1] / "samples"
 HERE = Datum(53.2686, -0.5245, heading=12.5)
@@ -123,3 +129,39 @@ def test_a_format_is_not_made_from_nothing(name: str) -> None:
     with pytest.raises((MissingLayer, CannotConvert)) as caught:
         chain(known, Stock(frozenset(), False), known.write_options())
     assert "supply" in caught.value.detail or "needs" in caught.value.detail
+
+
+FILE_NAME_IS_CONTENT = {"gazebo": "worlds are chosen by their file", "rmf_nav_graph": "a graph's file has its number"}
+"""Formats whose parts keep the name of a file; formats of grids, voxels and images name their part by it instead."""
+
+
+@pytest.mark.parametrize(("name", "files"), [case for case in CASES if case.values[0] not in FILE_NAME_IS_CONTENT])
+def test_equal_files_under_other_names_are_equal_content(name: str, files: dict[str, bytes]) -> None:
+    def hashes(named: dict[str, bytes]) -> dict[PartKey, bytes]:
+        made = {k: parts.compose(Draft(lambda _: {}), p, None, "") for k, p in layers_of(name, named).parts.items()}
+        return {key: part.hash for key, part in made.items() if part is not None}
+
+    before = hashes(files)
+    assert hashes({f"another folder/{n}": data for n, data in files.items()}) == before
+    for group in formats.group(files, name)[0]:
+        folder, slash, base = group.main.rpartition("/")
+        renamed = f"{folder}{slash}other{base[base.index('.') :]}"
+        if len(files) == 1:
+            after = hashes({renamed: files[group.main]})
+            assert after == before or after.keys() != before.keys()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_format_that_names_the_environment_says_so(name: str) -> None:
+    """Else a map of one environment would be served for another one of equal content."""
+    known = formats.get_format(name)
+    rows: list[Any] = [("a", shapely.Point(0, 0), {"kind": "node"}), ("b", shapely.Point(9, 0), {"kind": "node"})]
+    rows.append(("e", shapely.LineString([(0, 0), (9, 0)]), {"kind": "edge", "source": "a", "target": "b"}))
+    wall = ("wall", shapely.box(3, 3, 4, 4), {"kind": "wall", "height": 2.0})
+    layers = Layers({PartKey("topology", name="network"): features(rows, "local"),
+                     PartKey("objects", name="generated"): features([wall], "local")}, HERE)  # fmt: skip
+    try:
+        one, two = (from_layers(known, layers, {}, derived=True, title=title).files for title in ("one", "two"))
+    except CannotConvert:
+        pytest.skip("it needs other layers, and none of them has a name")
+    assert (one != two) == (known.titled or known.holds)

@@ -326,15 +326,25 @@ def test_several_drawings_in_one_part_keep_their_own_styles(same):
         assert len(lost) == 1
         assert "0, now 1" in lost[0]  # the other file's placemark, and nothing else
     again = objects(load(data)[0])
-    assert set(again.document["kml"]["documents"]) == set(files)
+    assert set(again.document["kml"]["documents"]) == set(together.document["kml"]["documents"])
+    assert len(again.document["kml"]["documents"]) == 2
     assert save(Layers({OBJECTS: again})) == data
-    for name, original in files.items():
-        mine = [k for k, p in enumerate(again.properties) if p["kml"]["document"] == name]
-        alone = {"kml": {"documents": {name: again.document["kml"]["documents"][name]}}}
+    for part, (name, original) in zip(parts, files.items(), strict=True):
+        (key,) = part.document["kml"]["documents"]
+        mine = [k for k, p in enumerate(again.properties) if p["kml"]["document"] == key]
+        alone = {"kml": {"documents": {key: again.document["kml"]["documents"][key]}}}
         assert (
             same("kml", {name: original}, {"b.kml": save(Layers({OBJECTS: again.take(mine).with_document(alone)}))})
             == []
         )
+
+
+def test_ids_and_levels_that_look_like_numbers_come_back_as_they_were():
+    part = features([("12", shapely.Point(1, 2), {"kind": "bench"}), ("1e3", shapely.Point(3, 4), {})], "local")
+    key = PartKey("objects", "2", "generated")
+    again, _ = load(save(Layers({key: part}, Datum(10.0, 20.0), (Level("2", 3.0),))))
+    assert again.parts[key].ids == part.ids
+    assert again.levels == (Level("2", 3.0),)
 
 
 @pytest.mark.parametrize("ring", ["7,50 8,51 7,50", "7,50,1 8,51,2 7,50,1", "7,50 8,51 8,51 7,50", "7,50 7,50", "7,50"])
@@ -528,7 +538,8 @@ def test_a_grid_tells_where_it_lies():
     assert context.dropped[0]["what"] == "occupancy"
     overlay = root.find(".//{*}GroundOverlay")
     assert overlay.findtext(".//{*}href") == "map.png"
-    assert float(overlay.findtext("{*}LatLonBox/{*}rotation")) == pytest.approx(25.0 - 33.0)
+    turned = float(overlay.findtext("{*}LatLonBox/{*}rotation"))
+    assert turned == pytest.approx(25.0 - 33.0, abs=1e-3), "against north at its own middle, not at the datum"
     quad = overlay.findtext("{*}LatLonQuad/{*}coordinates")
     assert layers.frame is not None
     corners = np.array([list(map(float, c.split(","))) for c in quad.split()])

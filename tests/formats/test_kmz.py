@@ -12,13 +12,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
+from lxml import etree
 
+from app.convert import offline
 from app.errors import BadUpload, TooLarge, UnreadableFile
-from app.formats import Group, Limits, ReadContext, WriteContext, _archive, get_format, read, write
+from app.formats import (
+    Group,
+    Limits,
+    ReadContext,
+    WriteContext,
+    _archive,
+    get_format,
+    group,
+    read,
+    write,
+    write_options,
+)
 from app.model.features import Features
-from app.model.frame import GROUND, Datum
+from app.model.frame import GROUND, Datum, Level
 from app.model.grid import OccupancyGrid
+from app.model.imagery import Picture
 from app.model.layers import MAP, Layers, PartKey, Resources
 
 SAMPLES = Path(__file__).parents[1] / "samples" / "kmz"
@@ -196,3 +211,103 @@ def test_another_reader_reads_what_we_write(tmp_path):
     done = subprocess.run([tool, "-ro", "-al", str(path)], capture_output=True, text=True, check=True)
     assert "ERROR" not in done.stdout + done.stderr
     assert "Yard" in done.stdout
+
+
+def a_picture(bands: int = 3, **more: Any) -> Picture:
+    pixels = np.random.default_rng(bands).integers(0, 255, (4, 6, bands), np.uint8)
+    c, s = 0.5 * math.cos(0.3), 0.5 * math.sin(0.3)
+    return Picture(pixels, **{"transform": (c, s, 10.0, s, -c, 20.0), **more})
+
+
+EARTH = {"crs": "EPSG:32632", "transform": (0.5, 0.0, 356000.0, 0.0, -0.5, 5540000.0)}
+
+
+@pytest.mark.parametrize("bands", [1, 2, 3, 4])
+@pytest.mark.parametrize("place", [{}, EARTH], ids=["local", "utm"])
+def test_pictures_come_back_from_kmz_at_the_same_place(bands: int, place: dict[str, Any]) -> None:
+    key = PartKey("imagery", "2", "plan")
+    picture = a_picture(bands, properties={"attribution": ["© Somebody"]}, **place)
+    context = WriteContext()
+    data = write(get_format("kmz"), Layers({key: picture}, DATUM, (Level(), Level("2", 3.0))), context)["map.kmz"]
+    assert context.dropped == []
+    again = load(data).parts
+    assert list(again) == [key]
+    made = again[key]
+    assert isinstance(made, Picture)
+    assert (made.pixels == picture.pixels).all()
+    assert (made.transform, made.crs, made.properties) == (picture.transform, picture.crs, picture.properties)
+
+
+def test_a_picture_s_overlay_lies_where_pyproj_says() -> None:
+    picture = a_picture(**EARTH)
+    files = _archive.unpack(save(Layers({PartKey("imagery", name="aerial"): picture})), Limits())
+    root = etree.fromstring(files["doc.kml"])
+    assert root.findtext(".//{*}Icon/{*}href") == "aerial.png"
+    quad = [tuple(map(float, t.split(","))) for t in root.findtext(".//{*}LatLonQuad/{*}coordinates").split()]
+    to_earth = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
+    x, y = 356000.0, 5540000.0
+    corners = [(x, y - 2.0), (x + 3.0, y - 2.0), (x + 3.0, y), (x, y)]  # from the lower left one, counter-clockwise
+    assert np.allclose(quad, [to_earth.transform(*corner) for corner in corners], atol=1e-11)
+    box = {
+        n: float(root.findtext(f".//{{*}}LatLonBox/{{*}}{n}")) for n in ("north", "south", "east", "west", "rotation")
+    }
+    middle = [sum(c[k] for c in quad) / 4 for k in (0, 1)]
+    assert middle == pytest.approx([(box["east"] + box["west"]) / 2, (box["north"] + box["south"]) / 2], abs=1e-11)
+    convergence = pyproj.Proj("EPSG:32632").get_factors(*middle).meridian_convergence
+    assert box["rotation"] == pytest.approx(-convergence, abs=1e-4)
+
+
+def test_pictures_lie_beside_a_kml_only_if_asked_for() -> None:
+    known, key = get_format("kml"), PartKey("imagery", name="aerial")
+    layers = Layers({key: a_picture(**EARTH)}, DATUM)
+    bare = WriteContext()
+    assert list(write(known, layers, bare)) == ["map.kml"]
+    assert [(d["what"], d["count"]) for d in bare.dropped] == [("imagery", 1)]
+    files = write(known, layers, WriteContext(options=write_options(known, {"pictures": "true"})))
+    assert list(files) == ["map.kml", "aerial.png"]
+    (item,), rest = group({f"a/{name}": data for name, data in files.items()})
+    assert (item.format.name, sorted(item.files), rest) == ("kml", ["a/aerial.png", "a/map.kml"], [])
+    assert list(read(item, ReadContext()).parts) == [key]
+    told = ReadContext()
+    assert not read(Group(known, "map.kml", {"map.kml": files["map.kml"]}), told).parts
+    assert "'aerial.png' is not in the upload" in told.warnings[0].problem
+
+
+@pytest.mark.parametrize(
+    ("picture", "datum", "reason"),
+    [
+        (a_picture(), None, "there is no datum"),
+        (a_picture(crs="EPSG:4326", transform=(1.0, 0, 178.0, 0, -1.0, 5.0)), None, "not on earth"),
+        (a_picture(crs="EPSG:32601", transform=(9e4, 0, 1e5, 0, -9e4, 1e5)), None, "antimeridian"),
+        (a_picture(crs="EPSG:4326", transform=(0.1, 0, 1.0, 0, -0.1, 89.0)), None, "beyond ±85"),
+        (a_picture(crs="EPSG:2", transform=(1, 0, 0, 0, -1, 0)), None, "not known"),
+    ],
+    ids=["no datum", "off earth", "antimeridian", "polar", "no such CRS"],
+)
+def test_pictures_without_a_place_are_dropped_and_told(picture: Picture, datum: Datum | None, reason: str) -> None:
+    told = WriteContext()
+    data = write(get_format("kmz"), Layers({PartKey("imagery", name="p"): picture}, datum), told)["map.kmz"]
+    assert list(_archive.unpack(data, Limits())) == ["doc.kml"]
+    (line,) = told.dropped
+    assert (line["what"], line["count"]) == ("imagery ground/p", 1)
+    assert line["why"].startswith("it cannot be placed: ")
+    assert reason in line["why"]
+
+
+def test_values_that_an_overlay_cannot_show_are_told() -> None:
+    told = WriteContext()
+    heights = Picture(np.arange(24, dtype=np.float32).reshape(4, 6, 1), **EARTH, properties={"nodata": 3})
+    data = write(get_format("kmz"), Layers({PartKey("imagery", name="dem"): heights}), told)["map.kmz"]
+    assert [d["what"] for d in told.dropped] == ["imagery ground/dem: pixel values"]
+    made = load(data).parts[PartKey("imagery", name="dem")]
+    assert isinstance(made, Picture)
+    assert (made.pixels.shape, made.transform) == ((4, 6, 2), EARTH["transform"])
+
+
+def test_images_beside_a_kml_are_those_of_the_files() -> None:
+    room = SAMPLES.parent / "occupancy_grid" / "room"
+    files = {p.name: p.read_bytes() for p in room.iterdir()}
+    kmz = _archive.unpack(offline(files, "kmz", datum=DATUM).files["map.kmz"], Limits())
+    made = offline(files, "kml", datum=DATUM, options={"pictures": "true"}).files
+    assert made["room.png"] == kmz["room.png"]
+    assert list(offline(files, "kml", datum=DATUM).files) == ["map.kml"]

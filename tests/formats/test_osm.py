@@ -785,3 +785,91 @@ def test_hostile_words_are_no_tags() -> None:
         odd = Layers({**layers.parts, OBJECTS: features(rows, "wgs84", objects.document)}, layers.datum, layers.levels)
         odd = edited(odd, lambda rows, v=value: [(i, g, {**p, "width": v, "speed_limit": v}) for i, g, p in rows])
         assert write(odd) == write(layers), value
+
+
+FURTHER = """\
+ <note>The data is © its contributors</note>
+ <meta osm_base="2026-01-01T00:00:00Z"/>
+ <changeset id="7" open="true">
+  <tag k="comment" v="surveyed &amp; drawn"/>
+  <discussion>
+   <comment uid="5" user="ä">
+    <text>Why &lt;this&gt;?</text>
+   </comment>
+  </discussion>
+ </changeset>
+ <bounds minlat="1.0" minlon="1.0" maxlat="2.0" maxlon="2.0" origin="OpenStreetMap server"/>
+ <bounds minlat="2.0" minlon="1.5" maxlat="3.0" maxlon="2.5" origin="second download"/>
+ <node id="1" action="modify" visible="true" lat="1.5" lon="1.5">
+  <tag k="barrier" v="gate"/>
+  <photo href="gate.jpg"/>
+ </node>
+ <node id="2" lat="1.6" lon="1.6"/>
+ <node id="3" version="4" lat="1.7" lon="1.7">
+  <survey>on foot</survey>
+ </node>
+ <way id="4" action="modify">
+  <nd ref="2"/>
+  <nd ref="3"/>
+  <tag k="highway" v="path"/>
+  <bounds minlat="1.6" minlon="1.6" maxlat="1.7" maxlon="1.7"/>
+ </way>
+ <relation id="5">
+  <member type="way" ref="4" role=""/>
+  <tag k="type" v="route"/>
+  <survey by="bike">
+   <day>Monday</day>
+  </survey>
+ </relation>"""
+
+
+def test_elements_that_osm_does_not_know_come_back() -> None:
+    data = xml(FURTHER, '<osm version="0.6" generator="JOSM" upload="false">')
+    told, said = ReadContext(), WriteContext()
+    layers = read(data, told)
+    served = write(layers, said)
+
+    def tree(e: etree._Element) -> Any:
+        return e.tag, sorted(e.attrib.items()), (e.text or "").strip(), [tree(c) for c in e]
+
+    assert sorted(map(tree, etree.fromstring(served))) == sorted(map(tree, etree.fromstring(data)))
+    assert dict(etree.fromstring(served).attrib) == {"version": "0.6", "generator": "JOSM", "upload": "false"}
+    assert said.dropped == []
+    assert [p.where for p in told.warnings] == ["node 1", "node 3", "way 4", "relation 5"]
+    assert write(read(served)) == served
+
+
+@pytest.mark.parametrize("source", ["tmap2", "geojson"])
+def test_an_edge_from_a_node_to_itself_survives(source: str) -> None:
+    datum = Datum(53.0, -0.5)
+    here, there = shapely.Point(0, 0), shapely.Point(5, 0)
+
+    def edge(i: str, a: str, b: str, line: list[tuple[float, float]]) -> Any:
+        return i, shapely.LineString(line), {"kind": "edge", "source": a, "target": b, "action": "move_base"}
+
+    rows = [
+        ("a", here, {"kind": "node"}),
+        ("b", there, {"kind": "node"}),
+        edge("a_b", "a", "b", [(0, 0), (5, 0)]),
+        edge("b_b", "b", "b", [(5, 0), (5, 0)]),
+        edge("b_a", "b", "a", [(5, 0), (0, 0)]),
+    ]
+    known = formats.get_format(source)
+    files = formats.write(known, Layers({TOPOLOGY: features(rows, "local")}, datum), WriteContext())
+    main = next(iter(files))
+    uploaded = formats.read(Group(known, main, files), ReadContext(main=main))
+    served = write(Layers(uploaded.parts, datum))
+    again = network(read(served))
+    assert sorted(a == b for a, b in again.edges()) == [False, False, True]
+    assert networkx.is_isomorphic(again, networkx.MultiDiGraph([("a", "b"), ("b", "b"), ("b", "a")]))
+    assert write(read(served)) == served
+
+
+def test_a_node_twice_within_a_way_is_no_edge() -> None:
+    nodes = "".join(f'<node id="{k}" lat="1.{k}" lon="1"/>' for k in (1, 2))
+    refs = "".join(f'<nd ref="{k}"/>' for k in (1, 1, 2))
+    told = ReadContext()
+    twice = '<way id="4"><nd ref="2"/><nd ref="2"/><tag k="highway" v="path"/></way>'
+    found = network(read(xml(f'{nodes}<way id="3">{refs}<tag k="highway" v="path"/></way>{twice}'), told))
+    assert sorted(found.edges()) == [("n1", "n2"), ("n2", "n1")]
+    assert ["that segment is no edge" in p.problem for p in told.warnings] == [True, True]

@@ -346,6 +346,7 @@ def test_what_nodes_get_can_be_chosen(name: str) -> None:
     filled = {line["what"]: line["value"] for line in context.template}
     assert filled["nodes: verts"] == "an octagon of 1.5 m"
     assert (filled["nodes: xy_goal_tolerance"], filled["nodes: yaw_goal_tolerance"]) == (0.2, 0.5)
+    assert filled["nodes without an orientation: yaw_goal_tolerance"] == 6.29
     for wrong in ({"verts_radius": "0"}, {"yaw_goal_tolerance": "7"}, {"xy_goal_tolerance": "nan"}):
         with pytest.raises(Invalid):
             formats.write_options(known, wrong)
