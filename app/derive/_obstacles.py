@@ -21,8 +21,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes
-from app.errors import BadUpload, CannotConvert, Invalid, MissingDatum, NotFound, Problem
+from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer, NotFound, Problem, TooLarge
 from app.model import osm_tags, solids, worlds
 from app.model.features import Features, Properties
 from app.model.frame import MAX_METRES
@@ -61,6 +61,9 @@ OBSTACLES: Mapping[str, float] = {
 }
 """Kinds that stand in the way, and how wide a line of that kind, or a point's disc, is where nothing says: metres.
 The 0.1 m of a wall is what rmf_building_map_tools builds."""
+
+SURROUNDINGS = 5.0
+"""Metres around the origin of a solid that cannot be read: ground of which nothing is known."""
 
 MOST_TRIANGLES = 10_000_000
 """Of all solids of a site together: a mesh of some megabytes can stand in a world many thousand times."""
@@ -120,7 +123,8 @@ class Site:
 
     footprints: areas, lines or points (shapely); base and top: of each, metres above the level's floor (infinite where
     nothing says). triangles: float64 [n, 3, 3] of all solids, their heights above the level's floor too; owner: whose
-    they are. free: ground that is known to be free. counts: how many obstacles there are.
+    they are. free: ground that is known to be free. unknown: ground around solids that cannot be read, which is never
+    free. unreadable: why they cannot, each reason once.
     """
 
     footprints: list[Any] = field(default_factory=list)
@@ -129,6 +133,8 @@ class Site:
     triangles: Array = field(default_factory=lambda: np.empty((0, 3, 3)))
     owner: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     free: list[Any] = field(default_factory=list)
+    unknown: list[Any] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
 
     @property
     def count(self) -> int:
@@ -149,15 +155,22 @@ class Site:
 
 
 def sites(
-    layers: Layers, notes: Notes, *, doors_closed: bool = False, visuals: bool = False, world: str | None = None
+    layers: Layers,
+    notes: Notes,
+    *,
+    doors_closed: bool = False,
+    visuals: bool = False,
+    world: str | None = None,
+    surroundings: float = SURROUNDINGS,
 ) -> dict[str, Site]:
     """The sites of all levels that have objects; of several worlds one (``app.model.worlds``).
 
+    surroundings: metres around a solid that cannot be read.
     Raises MissingDatum where objects are places on earth without one, Invalid where there is no such world.
     """
     known = solids.Solids(layers.resources(), visuals=visuals)
     out: dict[str, Site] = {}
-    reader = _Reader(layers, notes, known, doors_closed)
+    reader = _Reader(layers, notes, known, doors_closed, surroundings)
     parts = {key: part for key, part in layers.vector("objects").items() if len(part)}
     if world is not None and not any(worlds.names(part) for part in parts.values()):
         raise Invalid("no world is stored", [Problem("no world is stored", where="world")])
@@ -193,6 +206,14 @@ def fences(layers: Layers, notes: Notes) -> dict[str, Any]:
     return out
 
 
+def unreadable_error(reasons: Iterable[str], what: str) -> MissingLayer:
+    """The error for a map that would be a guess, since solids cannot be read. what: what is therefore not known."""
+    named = list(dict.fromkeys(reasons))
+    more = f"; and {len(named) - 3} more" if len(named) > 3 else ""
+    detail = f"{what}, since solids of the objects cannot be read: {'; '.join(named[:3])}{more}"
+    return MissingLayer(detail, [Problem(reason) for reason in named[:100]])
+
+
 def fence_of(fences: Mapping[str, Any], level: str, ground: str) -> Any:
     """A level's fence, else that of the ground; None where there is none."""
     return fences.get(level, fences.get(ground))
@@ -201,12 +222,17 @@ def fence_of(fences: Mapping[str, Any], level: str, ground: str) -> Any:
 class _Reader:
     """Objects on their way to obstacles: what all parts share."""
 
-    def __init__(self, layers: Layers, notes: Notes, known: solids.Solids, doors_closed: bool) -> None:
+    def __init__(
+        self, layers: Layers, notes: Notes, known: solids.Solids, doors_closed: bool, surroundings: float
+    ) -> None:
         self.layers, self.notes, self.known, self.doors_closed = layers, notes, known, doors_closed
+        self.surroundings = surroundings
+        self.seen = replace(known, planes=True, visuals=True)
         self.found: dict[int, list[Array]] = {}
         self.left: Counter[str] = Counter()
         self.shapeless: Counter[str] = Counter()
         self.broken: list[tuple[str, str]] = []
+        self.unreadable: dict[str, list[str]] = {}
         self.bodiless = 0
         self.triangles = 0
 
@@ -222,7 +248,7 @@ class _Reader:
             elif kind in IGNORED or (kind in DOORS and not self.doors_closed):
                 self.left[kind] += 1
             elif p.get("shapes"):
-                self._solids(part.ids[k], p, site, level)
+                self._solids(part, k, site, level)
             else:
                 width = 0.1 if kind in DOORS or kind in HOLES else _width(kind, p)
                 if width is None:
@@ -269,19 +295,43 @@ class _Reader:
             return geometry
         return frame.geometries_to_local(np.array([geometry], object))[0]
 
-    def _solids(self, i: str, p: Properties, site: Site, level: str) -> None:
+    def _solids(self, part: Features, k: int, site: Site, level: str) -> None:
+        p = part.properties[k]
         try:
-            made = self.known.triangles(p)
-        except (Invalid, BadUpload) as error:
-            self.broken.append((i, error.detail))
-            return
+            made, unreadable = self.known.read(p)
+        except (Invalid, TooLarge) as error:
+            middle = shapely.get_coordinates(shapely.centroid(part.geometry[k]))
+            at = (float(middle[0, 0]), float(middle[0, 1])) if len(middle) and part.local[k] else (0.0, 0.0)
+            made, unreadable = np.empty((0, 3, 3)), [solids.Unreadable(error, at)]
+        if unreadable:
+            self._surround(part.ids[k], p, unreadable, site)
         self.triangles += len(made)
         if self.triangles > MOST_TRIANGLES:
             raise CannotConvert(f"the solids of the objects have more than {MOST_TRIANGLES} triangles")
+        if unreadable and not len(made):
+            return
         if len(made):
             self.found.setdefault(id(site), []).append(made - np.array([0.0, 0.0, self.layers.elevation(level)]))
         else:
             self.left["with planes or pictures only"] += 1
+
+    def _surround(self, i: str, p: Properties, unreadable: Sequence[solids.Unreadable], site: Site) -> None:
+        """The ground around solids of unknown extent: a disc, and what of the object is seen or said to be there."""
+        size = _size(p)
+        reach = max(self.surroundings, math.hypot(*size[:2]) / 2 if size else 0.0)
+        around = [shapely.Point(one.at).buffer(reach) for one in unreadable]
+        shapes = p.get("shapes")
+        for shape in shapes if isinstance(shapes, (list, tuple)) else ():
+            try:
+                around.append(self.seen.footprint({**p, "shapes": [shape]}))
+            except (Invalid, TooLarge):
+                continue  # the disc stands for it
+        site.unknown.append(shapely.union_all(around))
+        name = p.get("name")
+        for reason in dict.fromkeys(one.error.detail for one in unreadable):
+            self.unreadable.setdefault(reason, []).append(name if isinstance(name, str) and name else i)
+            if reason not in site.unreadable:
+                site.unreadable.append(reason)
 
     def finished(self, site: Site, level: str) -> Site:  # noqa: ARG002
         """The site with its solids' triangles."""
@@ -304,7 +354,15 @@ class _Reader:
         self.notes.drop("objects", self.bodiless, "they have neither an area nor a size")
         for i, why in self.broken[:100]:
             self.notes.warn(f"left out: {why}", where=i)
-        self.notes.drop("objects", len(self.broken), "their solids cannot be read")
+        self.notes.drop("objects", len(self.broken), "their ground cannot be read")
+        for reason, names in list(self.unreadable.items())[:100]:
+            called = ", ".join(name[:80] for name in names[:5]) + (" …" if len(names) > 5 else "")
+            objects = f"{len(names)} objects have" if len(names) > 1 else "1 object has"
+            text = f"{objects} a solid that cannot be read ({called}): {reason}; the ground around it is unknown"
+            self.notes.warn(text, where=names[0][:80])
+        if self.unreadable:
+            why = "solids that cannot be read have an unknown extent"
+            self.notes.fill("surroundings", self.surroundings, why, "surroundings")
 
 
 def body_of(properties: Properties, geometry: Any, known: solids.Solids) -> Any | None:

@@ -198,6 +198,10 @@ class Bodies:
         """The shapes whose words are known and whose files are there; the files go along."""
         out = []
         for shape in shapes:
+            if _sdf.is_absent(shape):
+                reason = f"{str(shape['uri'])[:200]} is not stored: upload it"
+                self._lost[f"solids of objects of kind {kind}", reason] += 1
+                continue
             if str(shape.get("type")) not in _sdf.SHAPES:
                 self._lost[f"shapes of objects of kind {kind}", f"Gazebo knows no {str(shape.get('type'))[:40]}"] += 1
                 continue

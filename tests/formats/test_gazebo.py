@@ -233,7 +233,10 @@ def test_an_orchard_from_a_list() -> None:
         "colour of ground": "ground_colour",
         "sun": "sun",
     }
-    assert [d["what"] for d in answer.report["dropped"]] == ["objects of kind model"]
+    assert [(d["what"], d["count"]) for d in answer.report["dropped"]] == [
+        ("objects of kind model", 1),
+        ("solids of objects of kind model", 1),
+    ]
 
 
 def test_a_lone_model_is_a_world_of_one() -> None:
@@ -359,7 +362,8 @@ def test_shapes_of_every_kind() -> None:
     assert line["height"] == 2
     assert [len(r) for r in line["points"]] == [4, 3]
     assert shape("<empty/>") is None
-    assert shape("<cone><radius>1</radius><length>2</length></cone>") is None
+    cone = "<cone><radius>1</radius><length>2</length></cone>"
+    assert shape(cone) == [{"type": "cone", "uri": "<cone>"}], "solid, whatever it is"
     with pytest.raises(UnreadableFile, match="3 numbers"):
         shape("<box><size>1 2</size></box>")
 
@@ -500,7 +504,7 @@ def test_nothing_else_is_looked_for(uri: str) -> None:
     mesh = f"<link name='l'><collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision></link>"
     files = {**world(f"<model name='m'>{mesh}</model>"), "sub/x.stl": b"x"}
     found = told(files)
-    assert "shapes" not in objects(found).properties[0]
+    assert objects(found).properties[0]["shapes"] == [{"type": "mesh", "uri": uri}], "a solid that nobody can read"
     assert any("supply" in w.problem or "kept" in w.problem for w in found.warnings)
     assert uri in offline(files, "gazebo").files["world.sdf"].decode()
 
