@@ -150,13 +150,9 @@ def _grid(
 ) -> OccupancyGrid | None:
     """A level's grid; None where nothing stands in the way and no floor says what is free."""
     low, high = band
-    meets = (site.triangles[:, :, 2].min(axis=1) <= high) & (site.triangles[:, :, 2].max(axis=1) >= low)
-    # A solid around the band without a surface in it still fills it.
-    meets = np.isin(site.owner, np.unique(site.owner[_spans(site, low)])) | meets
-    standing = [f for f, b, t in zip(site.footprints, site.base, site.top, strict=True) if b <= high and t > low]
-    if not standing and not meets.any() and (site.unreadable or not site.free):
+    here = site.cut(low, high)
+    if not here.count and (site.unreadable or not site.free):
         return None
-    here = Site(standing, triangles=site.triangles[meets], owner=site.owner[meets], free=site.free)
     if not here.count:
         notes.warn(f"nothing stands in a robot's way on the level {level}: all of its floor is free", where=level)
     box = here.bounds() if fence is None else tuple(shapely.bounds(fence).tolist())
@@ -169,35 +165,18 @@ def _grid(
         notes.warn(f"all obstacles of the level {level} lie outside the fence", where=level)
     frame = framed(box, parameters.resolution, notes)
     cells = blank(frame, fence, site.free)
-    solid = np.zeros_like(cells)
-    slab = np.array([[low, high]])
-    _raster.paint(solid, _raster.surfaces(here.triangles, frame, slab), OCCUPIED)
-    _raster.paint(solid, _raster.insides(here.triangles, here.owner, frame, slab[:, 0]), OCCUPIED)
-    _raster.paint(solid, _raster.areas(standing, frame, touched=True), OCCUPIED)
-    cells[solid == OCCUPIED] = OCCUPIED
+    here.draw(cells, frame, low, high)
     if fence is None and not site.free and not parameters.outside_free:
         _raster.flooded(cells, FREE, UNKNOWN)
         why = "neither floors nor a fence say how far the site reaches"
         notes.fill("ground that no walls enclose", "unknown", why, "outside_free")
-    _raster.paint(cells, _raster.areas(site.unknown, frame, touched=True), UNKNOWN)
-    cells[solid == OCCUPIED] = OCCUPIED
+    here.draw_unknown(cells, frame)
     _raster.grown(cells, OCCUPIED, parameters.inflate / frame.resolution)
     if not (cells == FREE).any():
         if site.unreadable:
             raise unreadable_error(site.unreadable, f"no free ground of the level {level} is known")
         notes.warn(f"no cell of the level {level} is free: {ENCLOSE}", where=level)
     return OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
-
-
-def _spans(site: Site, height: float) -> NDArray[np.bool_]:
-    """The triangles of solids that reach from below a height to above it."""
-    if not len(site.triangles):
-        return np.zeros(0, bool)
-    owners, index = np.unique(site.owner, return_inverse=True)
-    least, most = np.full(len(owners), np.inf), np.full(len(owners), -np.inf)
-    np.minimum.at(least, index, site.triangles[:, :, 2].min(axis=1))
-    np.maximum.at(most, index, site.triangles[:, :, 2].max(axis=1))
-    return np.asarray(((least <= height) & (most > height))[index])
 
 
 def framed(box: tuple[float, ...], resolution: float | None, notes: Notes) -> Frame:

@@ -763,5 +763,6 @@ register(
         ),
         family=NAME,
         rank=10,
+        version=2,
     )
 )

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from app import bundle, derive, parameters
 from app.bundle import Hints, Known
 from app.derive import Notes
-from app.derive._obstacles import OF_OSM
 from app.derive.location_to_occupancy import Parameters as BlankParameters
 from app.derive.location_to_occupancy import location_to_occupancy
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
@@ -27,6 +26,7 @@ from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, SITE, Layers, Part, PartKey, Resources
+from app.model.obstacles import OF_OSM
 from app.model.solids import TYPES
 from tests.model.test_meshes import stl
 
