@@ -115,7 +115,7 @@ class Maps:
                 raise recipes.exhausted(error, failed) from error
             tried = self._hindered(version, found)
             if tried is None:
-                return _with_origin(found, origin)
+                return replace(_with_origin(found, origin), failed=tuple(failed))
             without |= {tried.step}
             failed.append(tried)
 
@@ -249,7 +249,7 @@ class Maps:
             for k, why in used.items()
         ]
         ignored = [{"problem": reason} for reason in self._ignored(recipe)]
-        warnings = [*told["warnings"], *stale, *ignored]
+        warnings = [*recipes.detours(recipe.failed), *told["warnings"], *stale, *ignored]
         filled = making.labelled(told["template"], recipe.origin, recipe.version.templates)
         more = {"layers": lines, "attribution": credit, "template": filled, "dropped": dropped, "warnings": warnings}
         closures = applied_closures.report_lines(recipe.version, told["closures"])

@@ -141,6 +141,21 @@ def test_server_and_offline_conversion_give_equal_cells(api: Api) -> None:
     assert any("house" in w["problem"] and "walls.stl" in w["problem"] for w in told(api, "ruin")["warnings"])
 
 
+def test_another_way_than_the_usual_one_is_warned_of(api: Api) -> None:
+    """Where the objects' solids cannot be read and a network is stored, on the server and offline."""
+    path = TOWN[: TOWN.index(b'<way id="9"')] + TOWN[TOWN.index(b'<way id="8"') :]
+    files = {**house(None), "map.osm": path.replace(b"natural", b"note"), "datum.yaml": FENCE}
+    api.post("environments", {"name": "lane"})
+    api.upload("lane", files)
+    made(api, "lane")
+    for report in (told(api, "lane"), direct.offline(files, "occupancy_grid").report):
+        line = next(line for line in report["layers"] if line["layer"] == "occupancy")
+        assert [s["step"] for s in line["steps"]] == ["topology_to_occupancy"]
+        (warning,) = [w["problem"] for w in report["warnings"] if w["problem"].startswith("made another way")]
+        assert "objects_to_occupancy failed" in warning
+        assert "walls.stl is not there" in warning
+
+
 def test_a_drawing_of_regions_is_no_obstacle_and_says_so(api: Api) -> None:
     api.post("environments", {"name": "sketch"})
     square = [[0.001, 0], [0.002, 0], [0.002, 0.001], [0.001, 0]]
