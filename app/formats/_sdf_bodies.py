@@ -24,7 +24,7 @@ from app.model.grid import UNKNOWN, OccupancyGrid
 from app.parameters import parameter
 
 WALL = 0.1
-"""Thickness in metres of lines that nothing collides with and that say none."""
+"""Thickness in metres of walls, and of what is drawn as thin as they are, where nothing says it."""
 
 PLATE = 0.02
 """Thickness in metres of what is only drawn on the ground."""
@@ -73,7 +73,7 @@ class Usual:
     door_height: float = parameter(2.1, "height of doors that tell none", minimum=0.01, maximum=1000.0, unit="m")
     wall_thickness: float | None = parameter(
         None,
-        "of walls and other lines that tell no width; default: their kind's, 0.1 of a wall, as in derived grids",
+        "of walls and other thin lines that tell no width; default: 0.1, as in derived grids",
         minimum=0.001,
         maximum=100.0,
         unit="m",
@@ -307,6 +307,9 @@ class Bodies:
         if dimension > 1 or obstacles.says_width(one.properties) or obstacles.width_of(one.properties) is None:
             return None
         default = obstacles.width_of(one.properties) or 0.0
+        if dimension == 1 and default > WALL:  # a hedge or a river is none of the lines that are as thin as walls
+            self._filled.add((f"width of {kind}", default, "the objects tell none", ""))
+            return None
         if dimension == 1:
             return self._taken(f"width of {kind}", "wall_thickness", otherwise=default)
         if obstacles.size_of(one.properties) is not None:
