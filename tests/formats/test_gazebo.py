@@ -607,8 +607,8 @@ def test_objects_of_other_formats_become_static_models() -> None:
     assert extent("a_b") == (0, 0, 4, 10, 6, 7), "from 1 to 4 m above a floor at 3 m"
     assert extent("hall") == (20, 0, 3, 30, 12, 8)
     assert by["hall"].geometry.area == pytest.approx(holed.area)
-    assert extent("w") == (0, 19.9, 3, 5.1, 25, 5)
-    assert by["w"].geometry.area == pytest.approx(10 * 0.2, abs=0.03)
+    assert extent("w") == (-0.1, 19.9, 3, 5.1, 25.1, 5), "its ends reach half its width further, as in grids"
+    assert by["w"].geometry.area == pytest.approx(10.2 * 0.2, abs=0.03)
     assert extent("floor") == (0, 0, 2.9, 1, 1, 3), "one stands on it"
     assert by["door"].properties["shapes"][0]["visual"] is True
     assert by["field"].properties["shapes"][0]["visual"] is True
