@@ -28,7 +28,7 @@ def is_multipolygon(properties: Properties) -> bool:
 
 def areas_of(part: Features, rows: Iterable[int]) -> dict[int, Any | None]:
     """The area of each multipolygon among these rows, in the coordinates of its ways; None where its rings do not
-    close or ways are missing."""
+    close. Ways that are missing are left out."""
     wanted = [k for k in rows if part.ids[k].startswith("r") and is_multipolygon(part.properties[k])]
     index = part.index() if wanted else {}
     out: dict[int, Any | None] = {}
@@ -40,7 +40,7 @@ def areas_of(part: Features, rows: Iterable[int]) -> dict[int, Any | None]:
             if isinstance(member, (list, tuple)) and len(member) == 3 and member[0] == "way"
         ]
         lines = [shapely.get_coordinates(part.geometry[row]) for row in ways if row >= 0]
-        complete = all(row >= 0 and not part.properties[row]["osm"].get("missing") for row in ways)
+        complete = not any(part.properties[row]["osm"].get("missing") for row in ways if row >= 0)
         out[k] = assembled(lines) if complete else None
     return out
 
