@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from app.bundle import Hints, Known
 from app.convert import make as making
 from app.convert import recipe as recipes
 from app.convert import site
-from app.errors import Invalid, MissingLayer, Problem
+from app.errors import CannotConvert, Invalid, NotFound, Problem
 from app.formats import Files, Format, Limits
 from app.model.frame import Datum
 from app.model.layers import Layer, Layers
@@ -61,24 +61,22 @@ def _offline(
     known = formats.get_format(to)
     asked = dict(options)
     recipes.own_options(known, asked)
-    needed: frozenset[Layer] = known.needs.also.union(*known.needs.one_of)
+    needed: frozenset[Layer] = known.carries | known.needs.also.union(*known.needs.one_of)
     wanted = None if "objects" in needed else needed  # whatever can be read can be an object
     if site.asks_for_all(known, asked):
         wanted = None  # further parts may be derived from any layer
-    while True:
-        cells = bool(asked) or not known.outlines  # an option may ask for the images, too
-        knowing = Known(datum, None, wanted, cells, known.drawing or known.holds)
-        told = bundle.read(bundle.unpack(load(), limits), hints, knowing, limits)
-        have = told.layers(datum).layers
-        if not asked and any(layers <= have for layers in known.needs.one_of):
-            wanted = None  # nothing is asked by name and nothing has to be derived: not read again
-        try:
-            written = _made(known, told, datum, asked, derived=derived)
-            break
-        except (MissingLayer, Invalid):
-            if wanted is None:
-                raise
-            wanted = None  # what the format carries is not in the files: read all they have, to derive it from
+    cells = bool(asked) or not known.outlines  # an option may ask for the images, too
+    complete = wanted is None and cells
+    knowing = Known(datum, None, wanted, cells, known.drawing or known.holds)
+    told = bundle.read(bundle.unpack(load(), limits), hints, knowing, limits)
+    try:
+        written = _made(known, told, datum, asked, derived=derived and complete)
+    except (CannotConvert, Invalid, NotFound):
+        if complete:
+            raise
+        # Nothing is ever derived from layers that were read in part: a world without its meshes has no walls.
+        told = bundle.read(bundle.unpack(load(), limits), hints, replace(knowing, wanted=None, cells=True), limits)
+        written = _made(known, told, datum, asked, derived=derived)
     filled = making.labelled(written.report["template"], dict.fromkeys(asked, REQUEST))
     report = {**written.report, "template": filled}
     report |= {"warnings": [p.as_dict() for p in told.warnings] + written.report["warnings"]}

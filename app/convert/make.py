@@ -272,9 +272,11 @@ def from_layers(
             raise recipes.exhausted(error, failed) from error
         kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
         try:
-            return write(
+            written = write(
                 known, kept, asked, way, entries, origin, credit, closures=closures, around=layers, title=title
             )
+            warnings = [*recipes.detours(failed), *written.report["warnings"]]
+            return replace(written, report={**written.report, "warnings": warnings})
         except CannotDerive as error:
             without |= {error.step}
             failed.append(Hindrance(error.step, error.detail, error.choose))

@@ -117,7 +117,7 @@ class Maps:
                 raise recipes.exhausted(error, failed) from error
             tried = self._hindered(version, found)
             if tried is None:
-                return _with_origin(found, origin)
+                return replace(_with_origin(found, origin), failed=tuple(failed))
             without |= {tried.step}
             failed.append(tried)
 
@@ -251,7 +251,7 @@ class Maps:
             for k, why in used.items()
         ]
         ignored = [{"problem": reason} for reason in self._ignored(recipe)]
-        warnings = [*told["warnings"], *stale, *ignored]
+        warnings = [*recipes.detours(recipe.failed), *told["warnings"], *stale, *ignored]
         texts = {line["problem"] for line in warnings}
         warnings += [p.as_dict() for p in self._crossings(recipe) if p.problem not in texts]
         filled = making.labelled(told["template"], recipe.origin, recipe.version.templates)

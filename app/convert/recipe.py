@@ -103,7 +103,8 @@ class Recipe:
 
     origin: where the parameters that are no defaults came from (request, environment, a set); it is no part of the key.
     spread: every part that the chain gives, instead of one. members: the maps that this one is put together from.
-    archive: whether a zip of those is wanted. file: the wanted file's name in the map, where one is wanted.
+    archive: whether a zip of those is wanted. file: the wanted file's name in the map, where one is wanted. failed: the
+    cheaper ways that the content does not allow; no part of the key either.
     """
 
     version: Version
@@ -116,6 +117,7 @@ class Recipe:
     members: tuple[Member, ...] = ()
     archive: bool = False
     file: str | None = None
+    failed: tuple[Hindrance, ...] = ()
 
     @property
     def etag(self) -> str:
@@ -347,6 +349,11 @@ class Hindrance:
     step: str
     reason: str
     choose: bool = False
+
+
+def detours(failed: Sequence[Hindrance]) -> list[dict[str, Any]]:
+    """The warnings of a map that was made another way than the usual one: which step failed, and why."""
+    return [{"problem": f"made another way, since {one.step} failed: {one.reason}"} for one in failed if one.step]
 
 
 def exhausted(error: MissingLayer, failed: Sequence[Hindrance]) -> CannotConvert:

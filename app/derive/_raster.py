@@ -342,6 +342,19 @@ def expanded(spans: Spans) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArra
     return layer, row, np.repeat(spans[:, 2], times) + _within(times)
 
 
+def flooded(cells: NDArray[np.uint8], value: int, new: int) -> None:
+    """Give a new value to all cells of a value that are joined to the border by their sides through such cells."""
+    import cv2
+
+    height, width = cells.shape
+    rows, columns = np.arange(height), np.arange(width)
+    for row, column in ((rows, 0), (rows, width - 1), (0, columns), (height - 1, columns)):
+        for k in np.flatnonzero(cells[row, column] == value).tolist():
+            x, y = (column, k) if isinstance(column, int) else (k, row)
+            if cells[y, x] == value:  # not reached from another cell of the border
+                cv2.floodFill(cells, None, (int(x), int(y)), new, flags=4)
+
+
 def grown(cells: NDArray[np.uint8], value: int, distance: float) -> None:
     """Give a value to all cells whose middle is at most ``distance`` (in cells) from the middle of one that has it."""
     import cv2

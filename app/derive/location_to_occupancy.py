@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import shapely
 
 from app.derive import Notes, derives
-from app.derive._obstacles import fences
+from app.derive._obstacles import fences, sites, unreadable_error
 from app.derive.objects_to_occupancy import blank, cell_size, framed
 from app.errors import MissingLayer
 from app.model.grid import OccupancyGrid
@@ -21,13 +21,26 @@ class Parameters:
     resolution: float | None = cell_size()
 
 
-@derives(gives="occupancy", needs={"location"}, parameters=Parameters, cost=50.0, last=True)
+@derives(
+    gives="occupancy",
+    needs={"location"},
+    also=frozenset({"objects", "resources"}),
+    parameters=Parameters,
+    cost=50.0,
+    version=2,
+    last=True,
+)
 def location_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """A blank occupancy grid: free inside the fence, unknown outside; it knows of no obstacle.
 
-    The origin is a whole multiple of the resolution, yaw 0. Raises MissingLayer where there is a datum but no fence,
+    The origin is a whole multiple of the resolution, yaw 0. Raises MissingLayer where there is a datum but no fence, or
+    objects have solids that cannot be read;
     CannotConvert where the grid would be too large.
     """
+    known = sites(layers, Notes())
+    unreadable = [reason for site in known.values() for reason in site.unreadable]
+    if unreadable:
+        raise unreadable_error(unreadable, "a blank grid would call ground free that is not known")
     parts: dict[PartKey, Part] = {}
     for level, fence in fences(layers, notes).items():
         frame = framed(shapely.bounds(fence).tolist(), parameters.resolution, notes)

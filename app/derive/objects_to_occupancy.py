@@ -10,13 +10,19 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes, _raster, derives
-from app.derive._obstacles import IN_NO_WAY, Site, fence_of, fences, sites
+from app.derive._obstacles import IN_NO_WAY, SURROUNDINGS, Site, fence_of, fences, sites, unreadable_error
 from app.derive._raster import Frame
 from app.errors import Invalid, MissingLayer, Problem
 from app.model.frame import GROUND
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import MAP, Layers, Part, PartKey
 from app.parameters import parameter
+
+ENCLOSE = (
+    "nothing encloses any ground; upload a fence (datum.yaml with gnss_fence, or a drawing with layer=location) or "
+    "floors, or ask with outside_free=true where robots may drive all around"
+)
+"""What to do where no ground is known to be free."""
 
 HEIGHT = 0.2
 """Metres above the floor at which a slice is taken unless asked otherwise: a usual height of a robot's laser."""
@@ -64,7 +70,17 @@ class Parameters:
     resolution: float | None = cell_size()
     inflate: float = parameter(0.0, "how far obstacles are grown", minimum=0.0, maximum=100.0, unit="m")
     padding: float = parameter(
-        1.0, "free space around everything, where no fence says how far the site reaches", minimum=0.0, maximum=1000.0
+        1.0, "margin around everything, where no fence says how far the site reaches", minimum=0.0, maximum=1000.0
+    )
+    outside_free: bool = parameter(
+        False, "whether ground that neither floor, fence nor closed walls surround is free, too, and not unknown"
+    )
+    surroundings: float = parameter(
+        SURROUNDINGS,
+        "radius of unknown ground around a solid that cannot be read (a mesh that was not uploaded)",
+        minimum=0.0,
+        maximum=1000.0,
+        unit="m",
     )
     doors: Literal["open", "closed"] = parameter("open", "whether doors let a robot through")
     visuals: bool = parameter(False, "whether shapes that are only seen and collide with nothing count")
@@ -77,14 +93,16 @@ class Parameters:
     also=frozenset({"resources", "location"}),
     parameters=Parameters,
     cost=4.0,
+    version=2,
 )
 def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """What stands on the ground at a height, as an occupancy grid for each level.
 
     Solids are cut, footprints rasterised; every cell that an obstacle touches is occupied. Free: the floors where there
-    are any, else the fence, else the box around everything with its padding; elsewhere unknown. The origin is a whole
-    multiple of the resolution, yaw 0. Raises MissingLayer where nothing stands in a robot's way, MissingDatum where the
-    objects are places on earth and there is none.
+    are any, else the fence, else what obstacles enclose; elsewhere unknown, as is the ground around solids that cannot
+    be read. The origin is a whole multiple of the resolution, yaw 0. Raises MissingLayer where nothing stands in a
+    robot's way, or solids that cannot be read leave nothing known; MissingDatum where the objects are places on earth
+    and there is none.
     """
     if parameters.height is not None and parameters.band is not None:
         raise Invalid("height and band exclude each other", [Problem("give height or band", where="band")])
@@ -93,7 +111,14 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
     if low > high:
         raise Invalid("band: the low height comes first", [Problem("the low height comes first", where="band")])
     closed, seen = parameters.doors == "closed", parameters.visuals
-    known = sites(layers, notes, doors_closed=closed, visuals=seen, world=parameters.world)
+    known = sites(
+        layers,
+        notes,
+        doors_closed=closed,
+        visuals=seen,
+        world=parameters.world,
+        surroundings=parameters.surroundings,
+    )
     around = fences(layers, notes)
     parts: dict[PartKey, Part] = {}
     reach: list[tuple[float, float]] = []
@@ -109,6 +134,9 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
             f"; the solids reach from {min(r[0] for r in reach):g} to {max(r[1] for r in reach):g} m" if reach else ""
         )
         what = f"at {low:g} m above the floor" if low == high else f"between {low:g} and {high:g} m above the floor"
+        unreadable = [reason for site in known.values() for reason in site.unreadable]
+        if unreadable:
+            raise unreadable_error(unreadable, f"nothing that can be read stands in a robot's way {what}{there}")
         there += "".join(f"; {d['count']} {d['what']}: {d['why']}" for d in notes.dropped if d["why"] != IN_NO_WAY)
         raise MissingLayer(
             f"no stored object stands in a robot's way {what}{there}: ask for another height or band, or upload walls, "
@@ -122,13 +150,9 @@ def _grid(
 ) -> OccupancyGrid | None:
     """A level's grid; None where nothing stands in the way and no floor says what is free."""
     low, high = band
-    meets = (site.triangles[:, :, 2].min(axis=1) <= high) & (site.triangles[:, :, 2].max(axis=1) >= low)
-    # A solid around the band without a surface in it still fills it.
-    meets = np.isin(site.owner, np.unique(site.owner[_spans(site, low)])) | meets
-    standing = [f for f, b, t in zip(site.footprints, site.base, site.top, strict=True) if b <= high and t > low]
-    if not standing and not meets.any() and not site.free:
+    here = site.cut(low, high)
+    if not here.count and (site.unreadable or not site.free):
         return None
-    here = Site(standing, triangles=site.triangles[meets], owner=site.owner[meets], free=site.free)
     if not here.count:
         notes.warn(f"nothing stands in a robot's way on the level {level}: all of its floor is free", where=level)
     box = here.bounds() if fence is None else tuple(shapely.bounds(fence).tolist())
@@ -141,23 +165,18 @@ def _grid(
         notes.warn(f"all obstacles of the level {level} lie outside the fence", where=level)
     frame = framed(box, parameters.resolution, notes)
     cells = blank(frame, fence, site.free)
-    slab = np.array([[low, high]])
-    _raster.paint(cells, _raster.surfaces(here.triangles, frame, slab), OCCUPIED)
-    _raster.paint(cells, _raster.insides(here.triangles, here.owner, frame, slab[:, 0]), OCCUPIED)
-    _raster.paint(cells, _raster.areas(standing, frame, touched=True), OCCUPIED)
+    here.draw(cells, frame, low, high)
+    if fence is None and not site.free and not parameters.outside_free:
+        _raster.flooded(cells, FREE, UNKNOWN)
+        why = "neither floors nor a fence say how far the site reaches"
+        notes.fill("ground that no walls enclose", "unknown", why, "outside_free")
+    here.draw_unknown(cells, frame)
     _raster.grown(cells, OCCUPIED, parameters.inflate / frame.resolution)
+    if not (cells == FREE).any():
+        if site.unreadable:
+            raise unreadable_error(site.unreadable, f"no free ground of the level {level} is known")
+        notes.warn(f"no cell of the level {level} is free: {ENCLOSE}", where=level)
     return OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
-
-
-def _spans(site: Site, height: float) -> NDArray[np.bool_]:
-    """The triangles of solids that reach from below a height to above it."""
-    if not len(site.triangles):
-        return np.zeros(0, bool)
-    owners, index = np.unique(site.owner, return_inverse=True)
-    least, most = np.full(len(owners), np.inf), np.full(len(owners), -np.inf)
-    np.minimum.at(least, index, site.triangles[:, :, 2].min(axis=1))
-    np.maximum.at(most, index, site.triangles[:, :, 2].max(axis=1))
-    return np.asarray(((least <= height) & (most > height))[index])
 
 
 def framed(box: tuple[float, ...], resolution: float | None, notes: Notes) -> Frame:

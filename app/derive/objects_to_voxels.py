@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes, _raster, derives
-from app.derive._obstacles import Site, sites
+from app.derive._obstacles import Site, sites, unreadable_error
 from app.derive._raster import Array, Frame, Spans
 from app.errors import CannotConvert, MissingLayer
 from app.model import solids, voxels
@@ -58,7 +58,15 @@ class Parameters:
     world: str | None = parameter(None, "which of several worlds; default: gazebo…, else the shortest name")
 
 
-@derives(gives="voxels", needs={"objects"}, also=frozenset({"resources"}), parameters=Parameters, cost=6.0)
+@derives(  # last: they tell of no free space, so no grid is made of them where objects_to_occupancy refuses
+    gives="voxels",
+    needs={"objects"},
+    also=frozenset({"resources"}),
+    parameters=Parameters,
+    cost=6.0,
+    version=2,
+    last=True,
+)
 def objects_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """Solids and extruded footprints as occupied voxels, all levels in one map; nothing is said of free space.
 
@@ -78,6 +86,9 @@ def objects_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> L
         triangles += [one + up for one in made]
         guessed += without
     if not triangles:
+        unreadable = [reason for site in known.values() for reason in site.unreadable]
+        if unreadable:
+            raise unreadable_error(unreadable, "no stored object is known to have a body")
         raise MissingLayer(
             "no stored object has a body: upload walls, buildings, barriers, trees or a world with solids"
         )

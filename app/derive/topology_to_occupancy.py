@@ -16,7 +16,7 @@ from app.derive.objects_to_occupancy import HEIGHT, blank, cell_size, framed
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer
 from app.model.features import Features, Properties
 from app.model.frame import GROUND
-from app.model.grid import FREE, OCCUPIED, OccupancyGrid
+from app.model.grid import FREE, OccupancyGrid
 from app.model.layers import MAP, Layers, Part, PartKey
 from app.parameters import parameter
 
@@ -63,6 +63,7 @@ class Parameters:
     also=frozenset({"objects", "resources", "location"}),
     parameters=Parameters,
     cost=40.0,
+    version=2,
 )
 def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """Free along a network's edges, as wide as they are; occupied where objects stand; elsewhere unknown.
@@ -86,7 +87,10 @@ def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) 
         cells = blank(frame, None, [shapely.Point(box[0], box[1])])  # a floor without an area: all is unknown
         ground = open_ if fence is None else shapely.intersection(open_, fence)
         _raster.paint(cells, _raster.areas(ground, frame, touched=False), FREE)
-        _draw(cells, frame, known.get(level))
+        if level in known:
+            here = known[level].cut(HEIGHT, HEIGHT)
+            here.draw(cells, frame, HEIGHT, HEIGHT)
+            here.draw_unknown(cells, frame)
         if len(through):
             inside = through if fence is None else shapely.intersection(through, fence)
             _raster.paint(cells, _raster.areas(inside, frame, touched=False), FREE)
@@ -165,15 +169,3 @@ def _obstacles(layers: Layers, notes: Notes) -> dict[str, Site]:
     except (MissingDatum, CannotConvert) as error:
         notes.warn(f"objects are not drawn: {error.detail}")
         return {}
-
-
-def _draw(cells: NDArray[np.uint8], frame: _raster.Frame, site: Site | None) -> None:
-    """What stands at a laser's height, as occupied."""
-    if site is None:
-        return
-    here = [f for f, b, t in zip(site.footprints, site.base, site.top, strict=True) if b <= HEIGHT < t]
-    slab = np.array([[HEIGHT, HEIGHT]])
-    meets = (site.triangles[:, :, 2].min(axis=1) <= HEIGHT) & (site.triangles[:, :, 2].max(axis=1) >= HEIGHT)
-    _raster.paint(cells, _raster.surfaces(site.triangles[meets], frame, slab), OCCUPIED)
-    _raster.paint(cells, _raster.insides(site.triangles[meets], site.owner[meets], frame, slab[:, 0]), OCCUPIED)
-    _raster.paint(cells, _raster.areas(here, frame, touched=True), OCCUPIED)

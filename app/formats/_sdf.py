@@ -45,6 +45,9 @@ MOST_SHAPES = 250_000
 MODELS = "models"
 """The folder beside ``world.sdf`` that Gazebo is to look for models in."""
 
+BODILESS = frozenset({"sun", "ground_plane"})
+"""Models that uploads seldom hold and that stand in no robot's way."""
+
 _BLANK = re.compile(rb"\s+|<\?.*?\?>|<!--.*?-->", re.DOTALL)
 _ROOT = re.compile(rb"<sdf[\s>/]")
 _REFERENCE = re.compile(
@@ -476,10 +479,11 @@ class Body:
         return None if self.frames is None else self.frames.find(name)
 
     def shapes(self) -> list[dict[str, Any]]:
-        """What collides; of a model where nothing does, what is seen."""
-        if self.collisions:
-            return [s.as_dict() for s in self.collisions]
-        return [s.as_dict(visual=True) for s in self.visuals]
+        """What collides; of a model where nothing does, or not all that does is in the upload, also what is seen."""
+        out = [s.as_dict() for s in self.collisions]
+        if not out or any(is_absent(s) for s in out):
+            out += [s.as_dict(visual=True) for s in self.visuals]
+        return out
 
 
 class Unfolder:
@@ -506,6 +510,7 @@ class Unfolder:
         self._depth += 1
         frames = _Frames(self, file)
         inner: list[tuple[str, Body]] = []
+        absent: list[etree._Element] = []
         for child in model.iterchildren("link", "frame", "joint", "model", "include"):
             name = child.get("name", "")
             if child.tag == "link":
@@ -517,6 +522,7 @@ class Unfolder:
             else:
                 inside = self.include(child, file) if child.tag == "include" else self.body(child, file)
                 if inside is None:
+                    absent.append(child)
                     continue
                 said = pose_of(child) if child.tag == "include" else inside.pose
                 name = (text_of(child, "name") if child.tag == "include" else name) or inside.name
@@ -527,7 +533,11 @@ class Unfolder:
             for tag, found in (("collision", out.collisions), ("visual", out.visuals)):
                 for part in link.iterchildren(tag):
                     place = frames.within(pose_of(part), at, part)
-                    found += [Shape(words, place) for words in self.geometry(part.find("geometry"), file)]
+                    shapes = self.geometry(part.find("geometry"), file)
+                    found += [Shape(words, place) for words in shapes if tag == "collision" or not is_absent(words)]
+        for child in absent:
+            place = frames.within(pose_of(child), np.eye(4), child)
+            out.collisions += [Shape(words, place) for words in absent_model(child)]
         for name, inside in inner:
             at = frames.place(name)
             out.collisions += [Shape(s.words, at @ s.place) for s in inside.collisions]
@@ -581,7 +591,7 @@ class Unfolder:
         return self._files[path]
 
     def geometry(self, element: etree._Element | None, file: str) -> list[dict[str, Any]]:
-        """The shapes of a ``<geometry>``: none where it is empty, of an unknown kind, or where its mesh is missing."""
+        """The shapes of a ``<geometry>``: none where it is empty; see ``is_absent``."""
         if element is None:
             return []
         out: list[dict[str, Any]] = []
@@ -601,6 +611,7 @@ class Unfolder:
         return out
 
     def _shape(self, tag: str, e: etree._Element, file: str) -> dict[str, Any] | None:
+        """A shape. One that is unknown or whose file is not in the upload is noted as missing, and stays solid."""
         if tag == "box":
             return {"type": tag, "size": vector(e, "size", 3, (1.0, 1.0, 1.0))}
         if tag in ("cylinder", "capsule"):
@@ -620,7 +631,7 @@ class Unfolder:
             path = self.served.get(found) if found is not None and found in self.library.files else None
             if path is None:
                 self.missing(reference)
-                return None
+                return {"type": tag, "uri": reference}
             if tag == "mesh":
                 out: dict[str, Any] = {"type": tag, "file": path, "scale": vector(e, "scale", 3, (1.0, 1.0, 1.0))}
                 part = e.find("submesh")
@@ -629,9 +640,10 @@ class Unfolder:
                 return out
             size, position = vector(e, "size", 3, (1.0, 1.0, 1.0)), vector(e, "pos", 3, (0.0, 0.0, 0.0))
             return {"type": tag, "file": path, "size": size, "position": position}
-        if tag not in ("empty", "polyline"):
-            self.missing(f"<{tag}>")
-        return None
+        if tag == "empty":
+            return None
+        self.missing(f"<{tag}>")
+        return {"type": tag, "uri": f"<{tag}>"}
 
     def report(self) -> None:
         """One warning for each kind of thing that is not there."""
@@ -646,6 +658,18 @@ class Unfolder:
             else:
                 text = f"{reference[:200]}{often} is not in the upload: supply its files in models/"
             self.context.warn(text, where=reference[:200] or None)
+
+
+def is_absent(shape: Mapping[str, Any]) -> bool:
+    """Whether a shape is a solid that the upload does not tell: a mesh without its file, an unknown geometry."""
+    return "uri" in shape and "file" not in shape
+
+
+def absent_model(include: etree._Element) -> list[dict[str, Any]]:
+    """The solids of an ``<include>`` whose model is not in the upload: unknown, but for Gazebo's own sun and ground."""
+    reference = text_of(include, "uri")
+    name = reference.rstrip("/").rpartition("/")[2].lower().replace(" ", "_")
+    return [] if name in BODILESS else [{"type": "model", "uri": reference}]
 
 
 def _in(error: UnreadableFile | TooLarge, path: str) -> UnreadableFile | TooLarge:

@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 
 from app.errors import Invalid
 from app.formats import WriteContext, _sdf
-from app.model import solids
+from app.model import obstacles, solids
 from app.model.features import Feature
 from app.model.frame import is_writable
 from app.model.grid import UNKNOWN, OccupancyGrid
 from app.parameters import parameter
+
+WALL = 0.1
+"""Thickness in metres of walls, and of what is drawn as thin as they are, where nothing says it."""
 
 PLATE = 0.02
 """Thickness in metres of what is only drawn on the ground."""
@@ -68,12 +71,20 @@ class Usual:
     tree_height: float = parameter(3.0, "height of trees that tell none", minimum=0.01, maximum=1000.0, unit="m")
     pole_height: float = parameter(2.0, "height of poles that tell none", minimum=0.01, maximum=1000.0, unit="m")
     door_height: float = parameter(2.1, "height of doors that tell none", minimum=0.01, maximum=1000.0, unit="m")
-    wall_thickness: float = parameter(
-        0.1, "of walls and other lines that tell no width", minimum=0.001, maximum=100.0, unit="m"
+    wall_thickness: float | None = parameter(
+        None,
+        "of walls and other thin lines that tell no width; default: 0.1, as in derived grids",
+        minimum=0.001,
+        maximum=100.0,
+        unit="m",
     )
     floor_thickness: float = parameter(0.1, "of floors that tell no height", minimum=0.001, maximum=100.0, unit="m")
-    pole_radius: float = parameter(
-        0.05, "of obstacles of which only the place is known", minimum=0.001, maximum=100.0, unit="m"
+    pole_radius: float | None = parameter(
+        None,
+        "of obstacles of which only the place is known; default: their kind's, 0.15 of a pole, as in derived grids",
+        minimum=0.001,
+        maximum=100.0,
+        unit="m",
     )
     building_colour: tuple[float, float, float] = parameter(
         (0.75, 0.68, 0.6), "colour of buildings: red, green, blue", minimum=0.0, maximum=1.0
@@ -169,10 +180,16 @@ class Bodies:
         except Invalid as error:
             self._lost[f"objects of kind {kind}", error.detail[:200]] += 1
             return None
-        if shapes:
-            shapes = self._with_files(shapes, kind)
-        else:
-            shapes, pose = self._from_geometry(one, kind, elevation)
+        try:
+            if shapes:
+                shapes = self._with_files(shapes, kind)
+                if obstacles.role_of(said) == "mark":
+                    shapes = [{**shape, "visual": True} for shape in shapes]
+            else:
+                shapes, pose = self._from_geometry(one, kind, elevation)
+        except Invalid as error:
+            self._lost[f"objects of kind {kind}", error.detail[:200]] += 1
+            return None
         if not shapes:
             self._lost[f"objects of kind {kind}", "no solid is known: supply a height, shapes or a model"] += 1
             return None
@@ -182,9 +199,10 @@ class Bodies:
         self.hilly = self.hilly or any(shape.get("type") == "heightmap" for shape in shapes)
         return self._static(name, pose, shapes, COLOURS.get(kind), said.get("gazebo"))
 
-    def _taken(self, what: str, option: str, why: str = "the objects tell none") -> float:
-        """A measure that the options say; it is declared."""
-        value = float(getattr(self.usual, option))
+    def _taken(self, what: str, option: str, why: str = "the objects tell none", *, otherwise: float = 0.0) -> float:
+        """A measure that the options say, else the other one; it is declared."""
+        chosen = getattr(self.usual, option)
+        value = float(otherwise if chosen is None else chosen)
         self._filled.add((what, value, why, option))
         return value
 
@@ -198,6 +216,10 @@ class Bodies:
         """The shapes whose words are known and whose files are there; the files go along."""
         out = []
         for shape in shapes:
+            if _sdf.is_absent(shape):
+                reason = f"{str(shape['uri'])[:200]} is not stored: upload it"
+                self._lost[f"solids of objects of kind {kind}", reason] += 1
+                continue
             if str(shape.get("type")) not in _sdf.SHAPES:
                 self._lost[f"shapes of objects of kind {kind}", f"Gazebo knows no {str(shape.get('type'))[:40]}"] += 1
                 continue
@@ -220,61 +242,79 @@ class Bodies:
         return out
 
     def _from_geometry(self, one: Feature, kind: str, elevation: float) -> tuple[list[dict[str, Any]], list[float]]:
-        """Shapes and pose of a footprint, line or point in local metres; none where no height is known."""
-        said = one.properties
-        base = elevation + _positive(said.get("base"), 0.0)
-        height = _positive(said.get("height"), 0.0)
-        size = said.get("size")
-        if not height and _is_size(size) and size is not None:
-            height = float(size[2])
-        drawn = kind in DRAWN and not height
-        if not height and kind in HEIGHTS:
-            height = self._taken(f"height of {kind}", HEIGHTS[kind])
-        if kind == "floor" and not height:
-            height = self._taken("thickness of floor", "floor_thickness")
-            base -= height
-        if kind == "door" and drawn:
-            why = "the objects tell none; doors stand open: nothing collides"
-            height = self._taken("height of door", "door_height", why)
-        if drawn and not height:
-            height = PLATE
-            self._filled.add((f"height of {kind}", PLATE, "drawn on the ground, nothing collides with it", ""))
-        geometry = one.geometry
-        if shapely.is_empty(geometry) or not height:
+        """Shapes and pose of an outline in local metres, as ``app.model.obstacles`` has it; none where no height is
+        known. What stands in no way is seen, and nothing collides with it."""
+        said, geometry = one.properties, one.geometry
+        if shapely.is_empty(geometry):
             return [], []
+        role = obstacles.role_of(said)
+        body = obstacles.body_of(said, geometry, self._width(one)) if role == "outline" or kind == "lift" else None
+        base, top = obstacles.heights_of(said, geometry) if body is None else (body.base, body.top)
+        base = base if math.isfinite(base) else 0.0
         middle = np.round(shapely.get_coordinates(shapely.centroid(geometry))[0], 3) + 0.0
-        z = base
-        pose = said.get("pose")
-        if shapely.get_type_id(geometry) == 0 and isinstance(pose, (list, tuple)) and len(pose) == 6:
-            z = base + float(pose[2])
         shapes: list[dict[str, Any]] = []
-        for part in shapely.get_parts(geometry):
-            flat = shapely.transform(shapely.force_2d(part), lambda at: at - middle)
-            dimension = shapely.get_dimensions(flat)
-            if dimension == 2:
-                shapes += _areas(flat, height)
-            elif dimension == 1:
-                width = _positive(said.get("width"), 0.0)
-                if not width:
-                    width = self._taken(f"width of {kind}", "wall_thickness")
-                shapes += _segments(flat, height, width)
-            elif dimension == 0:
-                shapes.append(self._post(flat, height, said))
-        if drawn:
-            for shape in shapes:
-                shape["visual"] = True
-        return shapes, [float(middle[0]), float(middle[1]), round(z, 9) + 0.0, 0.0, 0.0, 0.0]
+        if role == "ground" and (area := obstacles.ground_of(said, geometry)) is not None:
+            height = _positive(said.get("height"), 0.0) if kind == "floor" else 0.0
+            height = height or self._taken(f"thickness of {kind}", "floor_thickness")
+            shapes += _lowered(_areas(_around(area, middle), height), height)
+        if body is not None:
+            height = top - base if math.isfinite(top) else self._height(kind)
+            if shapely.get_type_id(geometry) in (1, 5):
+                width, square = self._width(one) or obstacles.width_of(said) or 0.0, kind in obstacles.SQUARE
+                for line in shapely.get_parts(_around(geometry, middle)):
+                    shapes += _segments(line, height, width, square=square)
+            elif shapely.get_type_id(geometry) in (0, 4) and obstacles.size_of(said) is None:
+                radius = (self._width(one) or obstacles.width_of(said) or 0.0) / 2
+                for x, y in shapely.get_coordinates(_around(geometry, middle)).tolist():
+                    pose = [x, y, height / 2, 0.0, 0.0, 0.0]
+                    shapes.append({"type": "cylinder", "radius": radius, "length": height, "pose": pose})
+            else:
+                shapes += _areas(_around(body.area, middle), height)
+        elif role == "mark":
+            shapes += self._drawn(said, kind, _around(geometry, middle), top - base)
+        return shapes, [float(middle[0]), float(middle[1]), round(elevation + base, 9) + 0.0, 0.0, 0.0, 0.0]
 
-    def _post(self, point: Any, height: float, said: Mapping[str, Any]) -> dict[str, Any]:
-        """A point as a box of its size, else as a thin pole."""
-        x, y = (float(v) for v in shapely.get_coordinates(point)[0])
-        size = said.get("size")
-        pose = said.get("pose")
-        yaw = float(pose[5]) if isinstance(pose, (list, tuple)) and len(pose) == 6 else 0.0
-        if _is_size(size) and size is not None:
-            return {"type": "box", "size": [*map(float, size[:2]), height], "pose": [x, y, height / 2, 0.0, 0.0, yaw]}
-        radius = self._taken("radius of points", "pole_radius")
-        return {"type": "cylinder", "radius": radius, "length": height, "pose": [x, y, height / 2, 0.0, 0.0, yaw]}
+    def _drawn(self, said: Mapping[str, Any], kind: str, flat: Any, height: float) -> list[dict[str, Any]]:
+        """What is seen of an outline that stands in no way: as high as it says, a door as it stands open, else a plate
+        on the ground; none of a kind that is not drawn and says no height."""
+        if not (math.isfinite(height) and height > 0.0):
+            if kind == "door":
+                why = "the objects tell none; doors stand open: nothing collides"
+                height = self._taken("height of door", "door_height", why)
+            elif kind in DRAWN:
+                height = PLATE
+                self._filled.add((f"height of {kind}", PLATE, "drawn on the ground, nothing collides with it", ""))
+            else:
+                return []
+        shapes: list[dict[str, Any]] = []
+        for part in shapely.get_parts(flat):
+            if shapely.get_dimensions(part) == 2:
+                shapes += _areas(part, height)
+            elif shapely.get_dimensions(part) == 1:
+                width = _positive(said.get("width"), 0.0)
+                width = width or self._taken(f"width of {kind}", "wall_thickness", otherwise=WALL)
+                shapes += _segments(part, height, width, square=False)
+        return [{**shape, "visual": True} for shape in shapes]
+
+    def _height(self, kind: str) -> float:
+        """How high a body is that does not say it; the top of what is solid for a laser, whatever it is."""
+        return self._taken(f"height of {kind}", HEIGHTS.get(kind, "obstacle_height"))
+
+    def _width(self, one: Feature) -> float | None:
+        """How wide a line or a point is that does not say it, where the options do; declared in any case."""
+        kind = str(one.properties.get("kind"))
+        dimension = shapely.get_dimensions(one.geometry)
+        if dimension > 1 or obstacles.says_width(one.properties) or obstacles.width_of(one.properties) is None:
+            return None
+        default = obstacles.width_of(one.properties) or 0.0
+        if dimension == 1 and default > WALL:  # a hedge or a river is none of the lines that are as thin as walls
+            self._filled.add((f"width of {kind}", default, "the objects tell none", ""))
+            return None
+        if dimension == 1:
+            return self._taken(f"width of {kind}", "wall_thickness", otherwise=default)
+        if obstacles.size_of(one.properties) is not None:
+            return None
+        return 2.0 * self._taken(f"radius of {kind}", "pole_radius", otherwise=default / 2)
 
     def _static(
         self, name: str, pose: Sequence[float], shapes: Sequence[Mapping[str, Any]], colour: str | None, own: Any
@@ -386,18 +426,23 @@ def _positive(value: Any, otherwise: float) -> float:
     return float(value) if good else otherwise
 
 
-def _is_size(value: Any) -> bool:
-    return (
-        isinstance(value, (list, tuple))
-        and len(value) == 3
-        and all(isinstance(v, (int, float)) and not isinstance(v, bool) and 0.0 < v < math.inf for v in value)
-    )
+def _around(geometry: Any, middle: NDArray[np.float64]) -> Any:
+    """A geometry seen from above, in metres around a point."""
+    return shapely.transform(shapely.force_2d(geometry), lambda at: at - middle)
+
+
+def _lowered(shapes: list[dict[str, Any]], depth: float) -> list[dict[str, Any]]:
+    """The shapes so much lower."""
+    poses = [shape.get("pose", [0.0] * 6) for shape in shapes]
+    return [{**shape, "pose": [*p[:2], p[2] - depth, *p[3:]]} for shape, p in zip(shapes, poses, strict=True)]
 
 
 def _areas(area: Any, height: float) -> list[dict[str, Any]]:
-    """A polygon as a box where it is a rectangle, else as rings to be extruded."""
+    """Polygons, each as a box where it is a rectangle, else as rings to be extruded."""
     if shapely.area(area) <= 0.0:
         return []
+    if shapely.get_type_id(area) != 3:
+        return [shape for part in shapely.get_parts(area) for shape in _areas(part, height)]
     corners = shapely.get_coordinates(shapely.get_exterior_ring(area))[:-1]
     if len(corners) == 4 and shapely.get_num_interior_rings(area) == 0:
         a, b = corners[1] - corners[0], corners[2] - corners[1]
@@ -421,8 +466,8 @@ def _areas(area: Any, height: float) -> list[dict[str, Any]]:
     return out
 
 
-def _segments(line: Any, height: float, width: float) -> list[dict[str, Any]]:
-    """A line as a box for each segment, which overlap where they meet."""
+def _segments(line: Any, height: float, width: float, *, square: bool) -> list[dict[str, Any]]:
+    """A line as a box for each segment, which overlap where they meet. square: whether its ends reach on as far."""
     at = shapely.get_coordinates(line)
     steps = np.diff(at, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
@@ -431,8 +476,8 @@ def _segments(line: Any, height: float, width: float) -> list[dict[str, Any]]:
     out = []
     for k in keep:
         along = steps[k] / lengths[k]
-        before = width / 2 if closed or k != keep[0] else 0.0
-        after = width / 2 if closed or k != keep[-1] else 0.0
+        before = width / 2 if square or closed or k != keep[0] else 0.0
+        after = width / 2 if square or closed or k != keep[-1] else 0.0
         middle = (at[k] + at[k + 1]) / 2 + along * (after - before) / 2
         pose = [*(float(v) for v in middle), height / 2, 0.0, 0.0, math.atan2(float(along[1]), float(along[0]))]
         out.append({"type": "box", "size": [float(lengths[k]) + before + after, width, height], "pose": pose})

@@ -194,8 +194,7 @@ class _Reader:
                 shapes = list(self._custom(reference, self.main, where, ()))
                 pose = list(anchor)
             else:
-                shape = self._shape(item, reference, self.main, where)
-                shapes = [] if shape is None else [shape]
+                shapes = [self._shape(item, reference, self.main, where)]
                 pose = _sdf.six(matrix(anchor) @ matrix(_pose(item, where)))
             properties: dict[str, Any] = {"kind": "model", "name": name, "pose": pose, OWN: own}
             if shapes:
@@ -224,6 +223,7 @@ class _Reader:
                 yield from self._model(path, reference)
             else:
                 self.unfolder.missing(f"custom_models/{reference}")
+                yield {"type": "model", "uri": f"custom_models/{reference}"}
             return
         if path in above or len(above) >= DEEPEST:
             raise _refused(f"custom object {reference} includes itself, or is nested more than {DEEPEST} deep", where)
@@ -237,8 +237,8 @@ class _Reader:
             if kind == "custom":
                 for shape in self._custom(inner, path, place, (*above, path)):
                     yield self._placed(shape, anchor @ matrix(shape.get("pose", (0.0,) * 6)))
-            elif (found := self._shape(item, inner, path, place)) is not None:
-                yield self._placed(found, anchor @ matrix(_pose(item, place)))
+            else:
+                yield self._placed(self._shape(item, inner, path, place), anchor @ matrix(_pose(item, place)))
 
     def _placed(self, shape: Mapping[str, Any], at: _sdf.Matrix) -> dict[str, Any]:
         self._count += 1
@@ -248,8 +248,8 @@ class _Reader:
         pose = _sdf.six(at)
         return out | {"pose": pose} if any(pose) else out
 
-    def _shape(self, item: Mapping[str, Any], reference: str, near: str, where: str) -> dict[str, Any] | None:
-        """A primitive without its pose; ``visual`` where it says no ``collision``."""
+    def _shape(self, item: Mapping[str, Any], reference: str, near: str, where: str) -> dict[str, Any]:
+        """A primitive without its pose; ``visual`` where it says no ``collision``. See ``_sdf.is_absent``."""
         out: dict[str, Any]
         if reference == "sphere":
             out = {"type": reference, "radius": _number(item.get("radius"), f"{where}.radius")}
@@ -268,11 +268,12 @@ class _Reader:
             path = self.found.served.get(file) if file is not None else None
             if path is None:
                 self.unfolder.missing(uri)
-                return None
-            out = {"type": reference, "file": path, "scale": [1.0, 1.0, 1.0]}
+                out = {"type": reference, "uri": uri}
+            else:
+                out = {"type": reference, "file": path, "scale": [1.0, 1.0, 1.0]}
         else:
             self.unfolder.missing(f"<{reference[:40]}>")
-            return None
+            out = {"type": reference[:40], "uri": f"<{reference[:40]}>"}
         return out if item.get("collision") is True else {**out, "visual": True}
 
     # models
@@ -302,12 +303,8 @@ class _Reader:
             kind = _text(item.get("type"), f"{where}.type")
             own = {str(a): b for a, b in item.items() if a not in ("name", "position", "orientation")}
             properties: dict[str, Any] = {"kind": "model", "name": name, "pose": list(_pose(item, where)), OWN: own}
-            path = _custom(self.library, kind, self.main)
-            shapes = list(self._custom(kind, self.main, where, ()) if path else ())
-            if shapes:
+            if shapes := list(self._custom(kind, self.main, where, ())):
                 properties["shapes"] = shapes
-            elif path is None:
-                self.unfolder.missing(f"custom_models/{kind}")
             self._add(name, properties)
 
     def _model(self, folder: str, reference: str) -> list[dict[str, Any]]:
@@ -316,7 +313,8 @@ class _Reader:
         file = self.library.model_file(folder)
         body = None if file is None else self.unfolder.file(file)
         if body is None:
-            return []
+            self.unfolder.missing(f"custom_models/{reference}")
+            return [{"type": "model", "uri": f"custom_models/{reference}"}]
         own = _sdf.ZERO if body.pose is None else body.pose
         return [self._placed(s, own.matrix @ matrix(s.get("pose", (0.0,) * 6))) for s in body.shapes()]
 

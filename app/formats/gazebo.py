@@ -31,7 +31,7 @@ import orjson
 import shapely
 from lxml import etree
 
-from app.errors import BadUpload, Invalid, MissingLayer, NotFound, UnreadableFile
+from app.errors import BadUpload, Invalid, MissingLayer, NotFound, TooLarge
 from app.formats import (
     Files,
     Format,
@@ -266,7 +266,7 @@ class _Reader:
         footprints: Footprints,
     ) -> None:
         said: dict[str, Any] = {"kind": str(element.tag), "name": name, "pose": pose}
-        shapes = body.shapes() if body is not None and body.kind == "model" else []
+        shapes = _sdf.absent_model(element) if body is None else body.shapes() if body.kind == "model" else []
         if shapes:
             said["shapes"] = shapes
         shape, size = footprints.of(said, name)
@@ -373,23 +373,36 @@ class Footprints:
         return shapely.transform(area, lambda at: np.round(at @ turn + place, 9) + 0.0), size
 
     def _worked_out(self, said: Mapping[str, Any], name: str) -> tuple[Any, list[float] | None]:
-        solid = [shape for shape in said["shapes"] if not shape.get("visual")]
         if self._solid is None or self._flat is None:
             self._solid = solids.Solids(self.resources, planes=False, visuals=True)
             self._flat = solids.Solids(self.resources, planes=True, visuals=True)
-        alone = {"shapes": solid or said["shapes"]}
+        readable = [shape for shape in said["shapes"] if self._is_readable(shape, name)]
+        alone = {"shapes": [shape for shape in readable if not shape.get("visual")] or readable}
         tilted = {**alone, "pose": [0.0, 0.0, 0.0, *said["pose"][3:5], 0.0]}
         try:
             area = self._solid.footprint(tilted)
             area = self._flat.footprint(tilted) if shapely.is_empty(area) else area
             size = self._solid.size(alone) or self._flat.size(alone)
-        except (Invalid, UnreadableFile) as error:
-            if error.detail not in self._told:
-                self._told.add(error.detail)
-                place = error.problems[0].file if error.problems else None
-                self.context.warn(f"its solids are not known: {error.detail}"[:500], file=place, where=name[:80])
+        except (Invalid, TooLarge) as error:
+            self._tell(error, name)
             return None, None
         return area, None if size is None else [round(float(v), 9) + 0.0 for v in size]
+
+    def _is_readable(self, shape: Mapping[str, Any], name: str) -> bool:
+        """Whether a solid can be read; of one that is not in the upload the reader has warned already."""
+        try:
+            (self._flat or solids.Solids(self.resources)).shape(shape)
+        except (Invalid, TooLarge) as error:
+            if not _sdf.is_absent(shape):
+                self._tell(error, name)
+            return False
+        return True
+
+    def _tell(self, error: Invalid | TooLarge, name: str) -> None:
+        if error.detail not in self._told:
+            self._told.add(error.detail)
+            place = error.problems[0].file if error.problems else None
+            self.context.warn(f"its solids are not known: {error.detail}"[:500], file=place, where=name[:80])
 
 
 def _some(names: Sequence[str]) -> str:
@@ -753,5 +766,6 @@ register(
         family=NAME,
         titled=True,
         rank=10,
+        version=2,
     )
 )

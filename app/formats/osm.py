@@ -5,8 +5,9 @@ edge ``w<way>:<from>-<to>`` (a segment that the way repeats gets ``#2`` …), tw
 one node twice that is tagged ``self_loop=yes`` is an edge from that node to itself. Tags and
 the further attributes (version, user, timestamp …) stay with nodes and edges in ``properties.osm``. Everything else is
 an object of the family ``osm``: tagged or lone nodes ``n<id>``, all ways ``w<id>`` (the highways too, so that they come
-back whole and in order) and relations ``r<id>``. Nodes that only bend a line are no objects: their ids and attributes
-stand with their way, in ``refs`` and ``vertices``, and their places in its geometry. ``properties.osm`` of an object:
+back whole and in order) and relations ``r<id>``, a multipolygon with its area. Nodes that only bend a line are no
+objects: their ids and attributes stand with their way, in ``refs`` and ``vertices``, and their places in its geometry.
+``properties.osm`` of an object:
 
 ========== ============================================================================================================
 tags       key -> value
@@ -36,7 +37,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
 from typing import Any, Literal
 
@@ -53,6 +54,7 @@ from app.model import osm_tags
 from app.model.features import NO_GEOMETRY, Features, Properties, alike, from_columns, points, segments
 from app.model.frame import GROUND
 from app.model.layers import NETWORK, Layers, Part, PartKey
+from app.model.osm_areas import areas_of
 
 FAMILY = "osm"
 GENERATOR = "Fleet Map Server"
@@ -523,7 +525,15 @@ def _objects(data: Data, network: _Network, context: ReadContext, document: Prop
         properties.append(_properties(said, relation.tags, "relation"))
     ids += [f"r{i}" for i in relations]
     nothing = np.full(len(relations), NO_GEOMETRY, object)
-    return from_columns(ids, np.concatenate([geometry, shapes, nothing]), properties, "wgs84", document)
+    part = from_columns(ids, np.concatenate([geometry, shapes, nothing]), properties, "wgs84", document)
+    areas = areas_of(part, range(len(ids) - len(relations), len(ids)))
+    if open_ := [part.ids[k][1:] for k, area in areas.items() if area is None]:
+        some = ", ".join(open_[:5]) + (" …" if len(open_) > 5 else "")
+        context.warn(f"{len(open_)} multipolygons have no area, since ways are missing or rings do not close: {some}")
+    with_area = part.geometry.copy()
+    for k, area in areas.items():
+        with_area[k] = area or NO_GEOMETRY
+    return replace(part, geometry=with_area)
 
 
 def _vertices(data: Data, refs: list[int], index: list[int], features: set[int]) -> Any:

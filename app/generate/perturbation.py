@@ -23,7 +23,6 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes
-from app.derive._obstacles import body_of
 from app.derive.objects_to_occupancy import Parameters as Slice
 from app.derive.objects_to_occupancy import objects_to_occupancy
 from app.errors import BadUpload, CannotConvert, CannotGenerate, Invalid, Problem
@@ -32,6 +31,7 @@ from app.model import masks, solids
 from app.model.features import Features, features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import MAP, Layers, Part, PartKey
+from app.model.obstacles import footprint_of
 from app.parameters import parameter
 
 Array = NDArray[np.float64]
@@ -242,7 +242,7 @@ class _Level:
             metres = part.in_local(self.given.frame)
             for k, (p, geometry) in enumerate(zip(part.properties, metres, strict=True)):
                 try:
-                    body = body_of(p, geometry, known)
+                    body = footprint_of(p, geometry, known)
                 except (Invalid, BadUpload) as error:
                     self.notes.warn(f"it stays as it is: {error.detail}", where=part.ids[k])
                     continue

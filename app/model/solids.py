@@ -18,6 +18,9 @@ mesh       file, scale [x, y, z], submesh, center        the file's
 heightmap  file, size [x, y, z], position [x, y, z]      its middle; the picture's brightest pixel is at size z
 ========== ============================================= ==============================================================
 
+A shape with a ``uri`` and no ``file`` is a solid that the upload does not tell: a mesh that is not in it, a geometry of
+an unknown type; the type ``model`` stands for all solids of a model that is not in it. ``Solids.read`` reports them.
+
 ``visual: true`` marks a shape that only visuals have: nothing collides with it; ``unseen: true`` one that is only
 collided with. ``colour`` [r, g, b] or [r, g, b, a], 0 to 1, is how it is shown.
 """
@@ -64,6 +67,14 @@ MOST_OUTLINES = 5_000
 _NOTHING: Array = np.empty((0, 3, 3))
 
 
+@dataclass(frozen=True, slots=True)
+class Unreadable:
+    """A solid of unknown extent: why it cannot be read, and its origin (x, y) in metres, local frame."""
+
+    error: Invalid | TooLarge
+    at: tuple[float, float]
+
+
 @dataclass(slots=True)
 class Solids:
     """Objects' files, each mesh of which is read once, however many shapes show it.
@@ -83,17 +94,32 @@ class Solids:
 
         Raises Invalid that names the file or the shape; the detail says what to supply for a missing file.
         """
+        found, unreadable = self.read(properties)
+        if unreadable:
+            raise unreadable[0].error
+        return found
+
+    def read(self, properties: Properties) -> tuple[Array, list[Unreadable]]:
+        """Those of an object's solids that can be read, as ``triangles`` gives them, and those that cannot.
+
+        Raises Invalid or TooLarge where that is so of the object as a whole.
+        """
+        own = matrix(pose_of(properties))
         found: list[Array] = []
+        unreadable: list[Unreadable] = []
         total = 0
         for k, shape in enumerate(shapes_of(properties)):
-            if self._counts(shape):
+            if not self._counts(shape):
+                continue
+            try:
                 found.append(self.shape(shape, f"shapes[{k}]"))
-                total += len(found[-1])
-                if total > MOST_TRIANGLES:
-                    raise TooLarge(f"an object has more than {MOST_TRIANGLES} triangles")
-        if not found:
-            return _NOTHING
-        return _checked(placed(np.concatenate(found), pose_of(properties)), "pose")
+            except (Invalid, TooLarge) as error:
+                unreadable.append(Unreadable(error, _origin(own, shape)))
+                continue
+            total += len(found[-1])
+            if total > MOST_TRIANGLES:
+                raise TooLarge(f"an object has more than {MOST_TRIANGLES} triangles")
+        return (_checked(_moved(np.concatenate(found), own), "pose") if found else _NOTHING), unreadable
 
     def footprint(self, properties: Properties) -> Any:
         """The ground that an object's solids stand over: a valid shapely geometry, metres, local frame; empty where it
@@ -123,6 +149,8 @@ class Solids:
         """One shape as triangles in its object's frame, float64 [n, 3, 3]."""
         kind = shape.get("type")
         make = _MAKERS.get(kind) if isinstance(kind, str) else None
+        if "file" not in shape and isinstance(shape.get("uri"), str):
+            _refuse_absent(str(shape["uri"]))
         if make is None:
             _refuse(f"has the type {str(kind)[:80]!r}; there are {', '.join(_MAKERS)}", where)
         return _checked(_moved(make(self, shape, where), matrix(pose_of(shape, where))), where)
@@ -145,8 +173,7 @@ class Solids:
         """A resource's bytes; Invalid says that it is to be supplied."""
         data = self.resources.get(path)
         if data is None:
-            reason = f"the file {path[:200]} is not there: upload it together with the objects"
-            raise Invalid(reason, [Problem(reason, path[:200])])
+            _refuse_absent(path)
         return data
 
     def _counts(self, shape: Mapping[str, Any]) -> bool:
@@ -471,6 +498,20 @@ def _turned(radii: Array, heights: Array, sides: int) -> Array:
 
 def _at_height(flat: Array, z: float) -> Array:
     return np.concatenate([flat, np.full((*flat.shape[:-1], 1), z)], axis=-1)
+
+
+def _origin(own: Array, shape: Mapping[str, Any]) -> tuple[float, float]:
+    """A shape's origin seen from above, in the frame around its object; the object's own where its pose is invalid."""
+    try:
+        at = (own @ matrix(pose_of(shape)))[:2, 3]
+    except Invalid:
+        at = own[:2, 3]
+    return float(at[0]), float(at[1])
+
+
+def _refuse_absent(path: str) -> NoReturn:
+    reason = f"the file {path[:200]} is not there: upload it together with the objects"
+    raise Invalid(reason, [Problem(reason, path[:200])])
 
 
 def _refuse(reason: str, where: str) -> NoReturn:

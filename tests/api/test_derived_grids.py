@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,10 @@ import pytest
 import yaml
 from PIL import Image
 
-from tests.api.conftest import Api
+from app.convert import files as direct
+from app.errors import MissingLayer
+from tests.api.conftest import Api, parts
+from tests.worlds import CRATE, WALLS, house
 
 TOWN = b"""<osm version="0.6">
 <node id="1" lat="52.0" lon="10.0"/><node id="2" lat="52.0" lon="10.0001"/><node id="3" lat="52.0001" lon="10.0001"/>
@@ -102,6 +106,56 @@ def test_a_committed_grid_goes_stale_with_a_fence_that_comes_later(api: Api) -> 
     assert report["steps"][0]["also"] == ["location", "resources"]
 
 
+def test_server_and_offline_conversion_give_equal_cells(api: Api) -> None:
+    """Of a world whose walls are a mesh, beside a box, with the mesh and without it."""
+    api.post("environments", {"name": "house"})
+    whole = {**house(WALLS, CRATE), "datum.yaml": FENCE}
+    api.upload("house", whole)
+    grey, _ = made(api, "house")
+    assert (grey == 0).sum() > 400, "a quarter of the house lies in the fence"
+    alone = direct.offline(whole, "occupancy_grid")
+    assert np.array_equal(np.asarray(Image.open(io.BytesIO(alone.files["map.pgm"]))), grey)
+    posted = api("POST", "convert", 200, files=parts(whole), data={"to": "occupancy_grid"})
+    with zipfile.ZipFile(io.BytesIO(posted.content)) as z:
+        assert z.read("map.pgm") == alone.files["map.pgm"]
+    # Without the mesh there is one crate, and what stands around it is not known: no blank grid of the fence either.
+    api.post("environments", {"name": "ruin"})
+    for extra in ((), (CRATE,)):
+        lost = {**house(None, *extra), "datum.yaml": FENCE}
+        api.upload("ruin", lost)
+        if not extra:
+            problem: Any = api.problem("GET", "environments/ruin/versions/latest/maps/occupancy_grid", 422)
+            assert "walls.stl is not there: upload it" in problem["detail"]
+            with pytest.raises(MissingLayer, match=r"walls\.stl is not there: upload it"):
+                direct.offline(lost, "occupancy_grid")
+            rows = {r["format"]: r for r in api.get("environments/ruin/versions/latest/maps").json()}
+            assert rows["occupancy_grid"]["state"] == "missing"
+            assert "walls.stl" in str(rows["occupancy_grid"]["missing"])
+    grey, _ = made(api, "ruin")
+    assert np.array_equal(
+        grey, np.asarray(Image.open(io.BytesIO(direct.offline(lost, "occupancy_grid").files["map.pgm"])))
+    )
+    assert (grey == 205).sum() * 0.05**2 > 0.2 * math.pi * 5.0**2, (
+        "a quarter of the disc around the house lies in the fence"
+    )
+    assert any("house" in w["problem"] and "walls.stl" in w["problem"] for w in told(api, "ruin")["warnings"])
+
+
+def test_another_way_than_the_usual_one_is_warned_of(api: Api) -> None:
+    """Where the objects' solids cannot be read and a network is stored, on the server and offline."""
+    path = TOWN[: TOWN.index(b'<way id="9"')] + TOWN[TOWN.index(b'<way id="8"') :]
+    files = {**house(None), "map.osm": path.replace(b"natural", b"note"), "datum.yaml": FENCE}
+    api.post("environments", {"name": "lane"})
+    api.upload("lane", files)
+    made(api, "lane")
+    for report in (told(api, "lane"), direct.offline(files, "occupancy_grid").report):
+        line = next(line for line in report["layers"] if line["layer"] == "occupancy")
+        assert [s["step"] for s in line["steps"]] == ["topology_to_occupancy"]
+        (warning,) = [w["problem"] for w in report["warnings"] if w["problem"].startswith("made another way")]
+        assert "objects_to_occupancy failed" in warning
+        assert "walls.stl is not there" in warning
+
+
 def test_a_drawing_of_regions_is_no_obstacle_and_says_so(api: Api) -> None:
     api.post("environments", {"name": "sketch"})
     square = [[0.001, 0], [0.002, 0], [0.002, 0.001], [0.001, 0]]
@@ -127,6 +181,10 @@ def test_real_buildings_and_towns(api: Api, shared: Path) -> None:
         api.post("environments", {"name": name})
         api.upload(name, {path.name: path.read_bytes()})
         level = "?level=L2" if name == "hotel" else ""
+        if name == "netherlands":  # nothing encloses a town
+            level = "?outside_free=true&resolution=0.2"
+            grey, _ = made(api, name, "?resolution=0.2")
+            assert (grey == 254).sum() < 0.01 * (grey == 205).sum()
         grey, _ = made(api, name, level)
         assert (grey == 0).sum() > 1000
         assert (grey == 254).sum() > 10_000

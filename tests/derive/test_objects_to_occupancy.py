@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from app import bundle, derive, parameters
 from app.bundle import Hints, Known
 from app.derive import Notes
-from app.derive._obstacles import OF_OSM
+from app.derive.location_to_occupancy import Parameters as BlankParameters
+from app.derive.location_to_occupancy import location_to_occupancy
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.derive.objects_to_voxels import Parameters as VoxelParameters
 from app.derive.objects_to_voxels import objects_to_voxels
@@ -25,6 +26,7 @@ from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, SITE, Layers, Part, PartKey, Resources
+from app.model.obstacles import OF_OSM
 from app.model.solids import TYPES
 from tests.model.test_meshes import stl
 
@@ -46,8 +48,11 @@ def layers(part: Features, *, level: str = "ground", **more: Any) -> Layers:
     return Layers(parts, **more)
 
 
-def grid(content: Layers, notes: Notes | None = None, level: str = "ground", **options: Any) -> OccupancyGrid:
-    made = objects_to_occupancy(content, Parameters(**options), notes if notes is not None else Notes())
+def grid(
+    content: Layers, notes: Notes | None = None, level: str = "ground", *, outside_free: bool = True, **options: Any
+) -> OccupancyGrid:
+    chosen = Parameters(outside_free=outside_free, **options)
+    made = objects_to_occupancy(content, chosen, notes if notes is not None else Notes())
     part = made.parts[PartKey("occupancy", level, MAP)]
     assert isinstance(part, OccupancyGrid)
     assert part.origin[2] == 0
@@ -288,6 +293,84 @@ def test_nothing_in_the_way_is_a_clear_problem(rows: list[Any]) -> None:
         grid(layers(objects(*rows)))
 
 
+def test_ground_that_nothing_encloses_is_unknown() -> None:
+    """Without floor and fence only what walls close off from the border is free."""
+    ring = [[[-3, -3], [3, -3], [3, 3], [-3, 3]], [[-2.5, -2.5], [2.5, -2.5], [2.5, 2.5], [-2.5, 2.5]]]
+    room = (None, {"kind": "model", "shapes": [{"type": "polyline", "points": ring, "height": 2}]})
+    notes = Notes()
+    g = grid(layers(objects(room)), notes, outside_free=False)
+    assert (at(g, 0, 0), at(g, -3.5, 0), at(g, 2.75, 0)) == (0, 255, 100)
+    assert [(t["value"], t["option"]) for t in notes.template] == [("unknown", "outside_free")]
+    assert not notes.warnings
+    alone = grid(layers(objects((None, {"kind": "model", "shapes": [BOX]}))), notes, outside_free=False)
+    assert not alone.counts()["free"]
+    assert (
+        "no cell of the level ground is free: nothing encloses any ground; upload a fence" in notes.warnings[0].problem
+    )
+    fenced = layers(objects((None, {"kind": "model", "shapes": [BOX]})), fence=shapely.box(-5, -5, 5, 5))
+    assert at(grid(fenced, outside_free=False), 3, 3) == 0
+    floor = (shapely.box(-5, -5, 5, 5), {"kind": "floor"})
+    assert at(grid(layers(objects(floor, (None, {"kind": "model", "shapes": [BOX]}))), outside_free=False), 3, 3) == 0
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [
+        {"type": "mesh", "file": "gone.dae"},
+        {"type": "mesh", "file": "bad.stl"},
+        {"type": "mesh", "uri": "package://gone.dae"},
+        {"type": "model", "uri": "model://gone"},
+        {"type": "mesh", "file": "cloud.xyz"},
+    ],
+    ids=lambda shape: str(shape.get("file") or shape.get("uri")),
+)
+def test_ground_around_a_solid_that_cannot_be_read_is_unknown(lost: dict[str, Any]) -> None:
+    """Never free, also within a fence; the object's other solids stay."""
+    rows = [
+        (
+            None,
+            {"kind": "model", "name": "shed", "shapes": [BOX, {**lost, "pose": [3, 0, 0, 0, 0, 0]}], "pose": [10, 0]},
+        ),
+        (None, {"kind": "model", "name": "barn", "shapes": [lost], "pose": [30, 0], "size": [16, 12, 3]}),
+    ]
+    fence = shapely.box(0, -20, 50, 20)
+    files = {"bad.stl": b"", "cloud.xyz": b"0 0 0"}
+    notes = Notes()
+    g = grid(layers(objects(*rows), fence=fence, files=files), notes)
+    assert (at(g, 10, 0), at(g, 13, 0), at(g, 13, 4.9), at(g, 13, 5.2)) == (100, 255, 255, 0)
+    assert (at(g, 30, 9.8), at(g, 30, 10.2)) == (255, 0), "what an object says of its size counts"
+    (warning,) = notes.warnings
+    assert "2 objects have a solid that cannot be read (shed, barn): " in warning.problem
+    assert str(lost.get("file") or lost.get("uri")) in warning.problem
+    assert ("surroundings", 5.0) in [(t["what"], t["value"]) for t in notes.template]
+    assert at(grid(layers(objects(*rows), fence=fence, files=files), surroundings=1.0), 13, 2) == 0
+
+
+def test_solids_that_cannot_be_read_refuse_a_grid_of_guesses() -> None:
+    lost = {"kind": "model", "shapes": [{"type": "mesh", "uri": "model://house/walls.dae"}]}
+    floor = (shapely.box(-9, -9, 9, 9), {"kind": "floor"})
+    for rows, more in (
+        ([(None, lost)], {}),
+        ([(None, lost), floor], {}),
+        ([(None, lost)], {"fence": shapely.box(-9, -9, 9, 9)}),
+        ([(None, lost), (None, {"kind": "model", "shapes": [BOX]})], {}),
+    ):
+        with pytest.raises(MissingLayer, match=r"model://house/walls\.dae is not there: upload it") as caught:
+            grid(layers(objects(*rows), **dict(more)), outside_free=False)
+        assert "model://house/walls.dae" in caught.value.problems[0].problem
+    with pytest.raises(MissingLayer, match=r"known to have a body.*walls\.dae"):
+        objects_to_voxels(layers(objects((None, lost))), VoxelParameters(), Notes())
+    content = layers(objects((None, lost)), fence=shapely.box(-9, -9, 9, 9))
+    with pytest.raises(MissingLayer, match=r"a blank grid.*walls\.dae"):
+        location_to_occupancy(content, BlankParameters(), Notes())
+
+
+def test_no_grid_is_made_of_the_voxels_of_objects() -> None:
+    """The way round by voxels would give what the slice refuses: nothing but obstacles."""
+    found = derive.plan(frozenset({"objects"}), frozenset({"occupancy"}), frozenset({"objects_to_occupancy"}))
+    assert found is None or "objects_to_voxels" not in [step.name for step in found.steps]
+
+
 def test_what_cannot_be_read_is_left_out_and_told() -> None:
     mesh = {"type": "mesh", "file": "bad.stl"}
     rows: list[Any] = [
@@ -297,11 +380,11 @@ def test_what_cannot_be_read_is_left_out_and_told() -> None:
     ]
     notes = Notes()
     flat = stl(((5, 5, 0), (5, 5, 0), (5, 5, 0)), ((6, 6, 0), (6, 6, 1), (7, 6, 0)))
-    g = grid(layers(objects(*rows), files={"bad.stl": b"", "flat.stl": flat}), notes)
+    g = grid(layers(objects(*rows), files={"bad.stl": b"", "flat.stl": flat}), notes, surroundings=0.5)
     assert at(g, 0, 0) == 100
     assert 100 in (at(g, 6.5, 6.02), at(g, 6.5, 5.98)), "an open triangle is still a surface"
     assert [(w.where, "bad.stl" in w.problem) for w in notes.warnings] == [("o1", True)]
-    assert notes.dropped == [{"what": "objects", "count": 1, "why": "their solids cannot be read"}]
+    assert notes.dropped == []
 
 
 def test_bodies_without_files_are_told_apart_from_marks() -> None:
@@ -323,7 +406,7 @@ def test_what_keeps_a_world_from_being_a_grid_is_told() -> None:
         (shapely.Point(0, 0), {"kind": "include"}),
         (None, {"kind": "model", "shapes": [{"type": "mesh", "file": "a.dae"}]}),
     ]
-    with pytest.raises(MissingLayer, match=r"1 objects include: .*; 1 objects: their solids"):
+    with pytest.raises(MissingLayer, match=r"cannot be read: the file a\.dae is not there: upload it"):
         grid(layers(objects(*rows)))
 
 
@@ -337,7 +420,7 @@ def test_a_mesh_that_stands_everywhere_is_limited(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(solids, "MOST_TRIANGLES", 20)
     notes = Notes()
     one = (None, {"kind": "model", "shapes": [BOX]})
-    grid(layers(objects(one, (None, {"kind": "model", "shapes": [BOX, BOX]}))), notes)
+    grid(layers(objects(one, (None, {"kind": "model", "shapes": [BOX, BOX]}))), notes, surroundings=1.0)
     assert "more than 20 triangles" in notes.warnings[0].problem
 
 
@@ -403,7 +486,8 @@ def test_whatever_objects_say_is_a_grid_or_a_clear_problem(rows: list[Any]) -> N
     try:
         made = grid(content, resolution=0.5, doors="closed")
     except CannotConvert as error:
-        assert "resolution of at least" in error.detail, "what lies far away makes it large"
+        expected = ("resolution of at least", "no free ground of the level ground is known, since solids")
+        assert any(text in error.detail for text in expected), "what lies far away makes it large"
     else:
         assert at(made, 0.5, 0.5) == 100
     try:
@@ -478,7 +562,10 @@ def test_a_real_building_is_its_walls_and_floors(
     middles = shapely.points(x, y)
     away = shapely.distance(middles, lines)
     assert (g.cells[away < 0.049] == 100).all()
-    assert (g.cells[away > 0.05 * math.sqrt(2) + 0.036 + 0.001] != 100).all()
+    lifts = [q for part in content.vector("objects").values() for q in part.properties if q.get("kind") == "lift"]
+    cabins = shapely.union_all([shapely.Point(q["pose"][:2]).buffer(2.2) for q in lifts])
+    apart = ~shapely.contains(cabins, middles)
+    assert (g.cells[apart & (away > 0.05 * math.sqrt(2) + 0.036 + 0.001)] != 100).all()
     inside = shapely.contains(floors, middles)
     assert (g.cells[inside & (g.cells != 100)] == 0).all()
     assert (g.cells[~inside & (g.cells != 100)] == 255).all()

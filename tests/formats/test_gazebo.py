@@ -233,7 +233,10 @@ def test_an_orchard_from_a_list() -> None:
         "colour of ground": "ground_colour",
         "sun": "sun",
     }
-    assert [d["what"] for d in answer.report["dropped"]] == ["objects of kind model"]
+    assert [(d["what"], d["count"]) for d in answer.report["dropped"]] == [
+        ("objects of kind model", 1),
+        ("solids of objects of kind model", 1),
+    ]
 
 
 def test_a_lone_model_is_a_world_of_one() -> None:
@@ -359,7 +362,8 @@ def test_shapes_of_every_kind() -> None:
     assert line["height"] == 2
     assert [len(r) for r in line["points"]] == [4, 3]
     assert shape("<empty/>") is None
-    assert shape("<cone><radius>1</radius><length>2</length></cone>") is None
+    cone = "<cone><radius>1</radius><length>2</length></cone>"
+    assert shape(cone) == [{"type": "cone", "uri": "<cone>"}], "solid, whatever it is"
     with pytest.raises(UnreadableFile, match="3 numbers"):
         shape("<box><size>1 2</size></box>")
 
@@ -500,7 +504,7 @@ def test_nothing_else_is_looked_for(uri: str) -> None:
     mesh = f"<link name='l'><collision name='c'><geometry><mesh><uri>{uri}</uri></mesh></geometry></collision></link>"
     files = {**world(f"<model name='m'>{mesh}</model>"), "sub/x.stl": b"x"}
     found = told(files)
-    assert "shapes" not in objects(found).properties[0]
+    assert objects(found).properties[0]["shapes"] == [{"type": "mesh", "uri": uri}], "a solid that nobody can read"
     assert any("supply" in w.problem or "kept" in w.problem for w in found.warnings)
     assert uri in offline(files, "gazebo").files["world.sdf"].decode()
 
@@ -600,11 +604,11 @@ def test_objects_of_other_formats_become_static_models() -> None:
     def extent(name: str) -> Any:
         return pytest.approx(box.bounds(by[name].properties), abs=1e-6)
 
-    assert extent("a_b") == (0, 0, 4, 10, 6, 8), "4 m high, 1 m above a floor at 3 m"
+    assert extent("a_b") == (0, 0, 4, 10, 6, 7), "from 1 to 4 m above a floor at 3 m"
     assert extent("hall") == (20, 0, 3, 30, 12, 8)
     assert by["hall"].geometry.area == pytest.approx(holed.area)
-    assert extent("w") == (0, 19.9, 3, 5.1, 25, 5)
-    assert by["w"].geometry.area == pytest.approx(10 * 0.2, abs=0.03)
+    assert extent("w") == (-0.1, 19.9, 3, 5.1, 25.1, 5), "its ends reach half its width further, as in grids"
+    assert by["w"].geometry.area == pytest.approx(10.2 * 0.2, abs=0.03)
     assert extent("floor") == (0, 0, 2.9, 1, 1, 3), "one stands on it"
     assert by["door"].properties["shapes"][0]["visual"] is True
     assert by["field"].properties["shapes"][0]["visual"] is True

@@ -1,0 +1,298 @@
+"""What is solid: the objects of a site that stand in a robot's way, by kind, as solids and as extruded footprints.
+
+The one place that decides it, for worlds (``app.formats.gazebo``), grids, voxels and pictures of grids.
+
+=========== ===========================================================================================================
+an object   counts
+=========== ===========================================================================================================
+of kind     ``floor``, ``lift``: as ground that is free (a lift's cabin by its ``pose`` and ``size``)
+of kind     ``lift``: also by the walls around its cabin, open at its doors, where Open-RMF says where these are
+of kind     ``hole``: as an obstacle, since a robot would fall in
+of kind     in ``OBSTACLES``: by its geometry; an OpenStreetMap kind only where the tag's value is one of ``OF_OSM``
+with        ``shapes``: by its solids (``app.model.solids``), whatever its kind but those of ``IGNORED``
+with        ``height`` or ``size``: by its geometry, or a box of its size where it is a point, whatever its kind
+of kind     ``door``: as an obstacle only where doors are taken as closed, whatever its shapes
+else        not: regions, points of interest, paths, roads, lights, measurements …
+=========== ===========================================================================================================
+
+An area counts as it is, a line as wide as it is (``width``, else its kind's), a point as a disc or as a box of its
+size. It reaches from ``base`` (else OpenStreetMap's ``min_height`` and ``building:min_level``, else the floor) to
+``height`` (else ``height`` and ``building:levels`` among the tags, else without end; ``app.model.osm_tags``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+
+from app.model import osm_tags, solids
+from app.model.features import Properties
+from app.model.frame import MAX_METRES
+
+Role = Literal["mark", "ground", "solids", "outline", "bodiless"]
+"""How an object counts: a mark stands in no way, ground is free, an outline is extruded, of others no body is known."""
+
+FREE = frozenset({"floor", "lift"})
+DOORS = frozenset({"door"})
+HOLES = frozenset({"hole"})
+IGNORED = frozenset(
+    {
+        *("region", "poi", "path", "light", "actor", "fiducial", "measurement", "human_lane", "fence_line", "label"),
+        *("ground_overlay", "overlay", "photo", "screen", "tour", "camera", "population", "road", "zone"),
+    }
+)
+"""Marks, moving things and things without a body."""
+
+CABIN_WALL = 0.05
+"""Metres: the thickness of a lift cabin's walls in rmf_building_map_tools."""
+
+SOLID = frozenset({"model", "include"})
+"""Kinds that have a body, which may be in files that nobody has supplied."""
+
+OBSTACLES: Mapping[str, float] = {
+    **dict.fromkeys(("wall", "fence", "hedge", "barrier", "railing"), 0.1),
+    **dict.fromkeys(("building", "obstacle", "furniture", "shelf", "rack", "table", "machine", "container"), 0.1),
+    **dict.fromkeys(("pillar", "column", "bollard", "post", "pole", "rock", "stone", "crate", "box"), 0.3),
+    **dict.fromkeys(("tree", "trunk", "bush", "shrub", "plant", "vegetation"), 0.3),
+    **dict.fromkeys(("water", "pond", "ditch", "stream"), 1.0),
+}
+"""Kinds that stand in the way, and how wide a line of that kind, or a point's disc, is where nothing says: metres.
+The 0.1 m of a wall is what rmf_building_map_tools builds."""
+
+WIDEST = 1000.0
+"""Metres of a line's or a point's width: beyond it is a mistake."""
+
+OF_OSM: Mapping[str, Mapping[str, float]] = {
+    "building": {"*": 0.1, "no": 0.0, "roof": 0.0},
+    "building:part": {"*": 0.1, "no": 0.0, "roof": 0.0},
+    "barrier": {
+        "*": 0.1,
+        "hedge": 1.0,
+        "ditch": 1.0,
+        "city_wall": 1.0,
+        "retaining_wall": 0.3,
+        **dict.fromkeys(("bollard", "block", "planter", "jersey_barrier", "log", "debris"), 0.4),
+        **dict.fromkeys(("gate", "lift_gate", "swing_gate", "sliding_gate", "entrance", "kerb", "cattle_grid"), 0.0),
+        **dict.fromkeys(("toll_booth", "border_control", "sally_port", "height_restrictor", "bump_gate", "no"), 0.0),
+    },
+    "natural": {
+        **dict.fromkeys(("tree", "shrub", "rock", "stone", "stump"), 0.4),
+        **dict.fromkeys(("tree_row", "scrub"), 1.0),
+        **dict.fromkeys(("water", "bay", "cliff", "sinkhole", "hot_spring"), 0.5),
+    },
+    "waterway": {
+        **dict.fromkeys(("river", "canal"), 5.0),
+        **dict.fromkeys(("stream", "ditch", "drain", "tidal_channel"), 1.0),
+        **dict.fromkeys(("riverbank", "dock", "weir", "dam", "waterfall"), 1.0),
+    },
+    "landuse": dict.fromkeys(("basin", "reservoir"), 1.0),
+    "leisure": dict.fromkeys(("swimming_pool",), 1.0),
+    "man_made": {
+        **dict.fromkeys(("tower", "silo", "storage_tank", "chimney", "mast", "water_tower", "gasometer"), 2.0),
+        **dict.fromkeys(("street_cabinet", "flagpole", "utility_pole", "monitoring_station", "water_well"), 0.4),
+    },
+    "power": {**dict.fromkeys(("tower", "transformer"), 2.0), **dict.fromkeys(("pole", "catenary_mast"), 0.3)},
+    "highway": dict.fromkeys(("street_lamp", "traffic_signals_pole"), 0.3),
+    "amenity": dict.fromkeys(("fountain", "bench", "post_box", "waste_basket", "telephone", "vending_machine"), 0.6),
+    "historic": dict.fromkeys(("monument", "memorial", "wayside_cross", "wayside_shrine"), 0.6),
+}
+"""OpenStreetMap: by a tag's key and value (``*``: any other), how wide a line or a point is; 0 stands in no way."""
+
+KEYS: Mapping[str, tuple[str, ...]] = {
+    "building": ("building", "building:part"),
+    "tree": ("natural",),
+    "water": ("natural", "waterway", "landuse", "leisure"),
+}
+"""The tags that an OpenStreetMap object's kind may come from, where it is not called as its main tag is."""
+
+SQUARE = frozenset({"wall"})
+"""Kinds whose lines reach half their width beyond their ends, so that walls that meet at a corner close it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """The ground that an object covers (polygons, metres), and from which height above its floor to which it reaches;
+    infinite where nothing says."""
+
+    area: Any
+    base: float
+    top: float
+
+
+def role_of(properties: Properties, *, doors_closed: bool = False) -> Role:
+    """How an object counts. doors_closed: whether doors are obstacles."""
+    kind = str(properties.get("kind") or "")
+    if kind in FREE:
+        return "ground"
+    if kind in IGNORED or (kind in DOORS and not doors_closed):
+        return "mark"
+    if properties.get("shapes"):
+        return "solids"
+    if width_of(properties) is not None:
+        return "outline"
+    return "bodiless" if kind in SOLID and not _tags(properties) else "mark"
+
+
+def body_of(properties: Properties, geometry: Any, width: float | None = None) -> Body | None:
+    """The body of an object whose role is ``outline``, or of a lift's walls; None where it has none.
+
+    geometry: in local metres. width: of a line, or of a point's disc, instead of the object's own. Raises Invalid where
+    its pose cannot be used.
+    """
+    if properties.get("kind") == "lift":
+        return None if properties.get("shapes") else _cabin(properties, geometry)
+    area = _area(shapely.force_2d(geometry), properties, width or width_of(properties) or 0.0)
+    return None if area is None or area.is_empty else Body(area, *heights_of(properties, geometry))
+
+
+def ground_of(properties: Properties, geometry: Any) -> Any | None:
+    """The ground of a floor or a lift's cabin, on which robots stand: polygons; None where it has none."""
+    area = _area(shapely.force_2d(geometry), properties, 0.0)
+    return area if area is not None and area.area > 0 else None
+
+
+def footprint_of(properties: Properties, geometry: Any, known: solids.Solids) -> Any | None:
+    """The ground that an object covers, whatever its height: polygons in metres; None where it stands in no way.
+
+    geometry: in local metres. Raises Invalid or BadUpload where its solids cannot be read.
+    """
+    role = role_of(properties)
+    if role == "solids":
+        shadow = known.footprint(properties)
+        return None if shadow.is_empty else shadow
+    body = body_of(properties, geometry) if role == "outline" else None
+    return None if body is None else body.area
+
+
+def _cabin(p: Properties, geometry: Any) -> Body | None:
+    """The walls around a lift's cabin, with gaps where its doors are; None where nothing says where these are: walls
+    without a way in would lock the cabin.
+
+    Source: rmf_building_map_tools, lift.py (doors: x, y in the cabin's frame, width along motion_axis_orientation).
+    """
+    size, own = size_of(p), p.get("openrmf")
+    says = own.get("says") if isinstance(own, Mapping) else None
+    doors = says.get("doors") if isinstance(says, Mapping) else None
+    if size is None or not isinstance(doors, Mapping):
+        return None
+    x, y = size[0] / 2, size[1] / 2
+    cabin = shapely.box(-x, -y, x, y)
+    walls = shapely.difference(cabin.buffer(CABIN_WALL, join_style="mitre"), cabin)
+    gaps = []
+    for door in doors.values():
+        numbers = [door.get(word) for word in ("x", "y", "motion_axis_orientation", "width")] if door else []
+        if not numbers or not all(isinstance(v, (int, float)) and abs(v) <= MAX_METRES for v in numbers):
+            return None
+        along = float(numbers[3]) / 2
+        across = max(x, y, CABIN_WALL) / 2  # through the wall that it is in, and not through the one opposite
+        gap = shapely.box(-along, -across, along, across)
+        turned = solids.placed(_flat(gap), (float(numbers[0]), float(numbers[1]), 0.0, 0.0, 0.0, float(numbers[2])))
+        gaps.append(shapely.Polygon(turned[:, :2]))
+    if not gaps:
+        return None
+    walls = shapely.difference(walls, shapely.union_all(gaps))
+    placed = shapely.transform(walls, lambda at: solids.placed(np.c_[at, np.zeros(len(at))], _pose(p, geometry))[:, :2])
+    return Body(placed, 0.0, size[2] if len(size) > 2 and size[2] > 0 else math.inf)
+
+
+def _flat(polygon: Any) -> Any:
+    """The corners of a polygon at height 0: float64 [n, 3]."""
+    return np.column_stack([shapely.get_coordinates(polygon), np.zeros(shapely.get_num_coordinates(polygon))])
+
+
+def _pose(p: Properties, geometry: Any) -> tuple[float, ...]:
+    """An object's pose; where it has none, its point."""
+    return solids.pose_of(p) if p.get("pose") is not None else (*shapely.get_coordinates(geometry)[0], 0, 0, 0, 0)
+
+
+def _tags(p: Properties) -> Mapping[str, Any]:
+    own = p.get("osm")
+    tags = own.get("tags") if isinstance(own, Mapping) else None
+    return tags if isinstance(tags, Mapping) else {}
+
+
+def says_width(properties: Properties) -> bool:
+    """Whether an object itself says how wide it is."""
+    return bool(_positive(properties.get("width")) or osm_tags.width(_tags(properties)))
+
+
+def width_of(properties: Properties) -> float | None:
+    """How wide a line or a point of an object is in metres; None where the object stands in no way."""
+    p, kind = properties, str(properties.get("kind") or "")
+    tags = _tags(p)
+    if kind in DOORS or kind in HOLES:
+        return 0.1
+    key = next((key for key in KEYS.get(kind, (kind,)) if key in tags), None)
+    if key is not None and key in OF_OSM:
+        if tags.get("tunnel") in ("yes", "culvert", "flooded") or tags.get("location") in ("underground", "overhead"):
+            return None
+        values = OF_OSM[key]
+        width = values.get(str(tags[key]), values.get("*", 0.0))
+        said = _positive(p.get("width")) or osm_tags.width(tags) or width
+        return min(said, WIDEST) if width else None
+    width = min(_positive(p.get("width")) or 0.0, WIDEST)
+    if kind in OBSTACLES and not tags:
+        return width or OBSTACLES[kind]
+    if not tags and (_positive(p.get("height")) or size_of(p)):
+        return width or 0.1
+    return None
+
+
+def _area(geometry: Any, p: Properties, width: float) -> Any:
+    """The ground that an object covers: a polygon in metres; None where it has none."""
+    if geometry.is_empty:
+        return None
+    kind = int(shapely.get_type_id(geometry))
+    size = size_of(p)
+    if kind in (0, 4) and size is not None:
+        x, y = size[0] / 2, size[1] / 2
+        return shapely.Polygon(solids.placed(_flat(shapely.box(-x, -y, x, y)), _pose(p, geometry))[:, :2])
+    if kind in (3, 6):
+        return shapely.make_valid(geometry)
+    if kind == 7:
+        bodies = [b for b in (_area(g, {}, width) for g in shapely.get_parts(geometry)) if b is not None]
+        return shapely.union_all(bodies) if bodies else None
+    if width <= 0:
+        return None
+    caps = "round" if kind in (0, 4) else "square" if p.get("kind") in SQUARE else "flat"
+    return shapely.buffer(geometry, width / 2, cap_style=caps, join_style="mitre", mitre_limit=2.0)
+
+
+def heights_of(properties: Properties, geometry: Any) -> tuple[float, float]:
+    """(base, top) of an extruded footprint in metres above the floor; the top is infinite where nothing says."""
+    p = properties
+    if p.get("kind") in HOLES:
+        return -math.inf, math.inf
+    tags = _tags(p)
+    base, top = _positive(p.get("base")), _positive(p.get("height"))
+    if base is None:
+        base = osm_tags.base(tags)
+    if top is None:
+        top = osm_tags.height(tags)
+    size = size_of(p)
+    if not top and size is not None and len(size) > 2 and size[2] > 0:
+        pose = p.get("pose")
+        if shapely.get_type_id(geometry) == 0 and isinstance(pose, (list, tuple)) and len(pose) > 2:
+            base = (base or 0.0) + (_positive(pose[2]) or 0.0)
+        top = (base or 0.0) + size[2]
+    return base or 0.0, top or math.inf
+
+
+def _positive(value: Any) -> float | None:
+    good = isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value <= MAX_METRES
+    return float(value) if good else None
+
+
+def size_of(p: Properties) -> tuple[float, ...] | None:
+    """[x, y(, z)] of a box; None where nothing says so."""
+    said = p.get("size")
+    if not isinstance(said, (list, tuple)) or len(said) < 2:
+        return None
+    numbers = [_positive(v) for v in said[:3]]
+    found = tuple(v for v in numbers if v is not None)
+    return found if len(found) == len(numbers) and found[0] > 0 and found[1] > 0 else None
