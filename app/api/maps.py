@@ -232,6 +232,12 @@ class Hot:
             ),
         )
 
+    def forget(self, request: Request) -> None:
+        """Drop what is remembered of an address."""
+        with self._lock:
+            old = self._entries.pop(_key(request), None)
+            self._size -= _weight(old) if old else 0
+
     def count(self) -> None:
         """Add what was answered from memory since the last call to the metrics."""
         for route, tally in list(self._tallies.items()):
@@ -477,7 +483,15 @@ async def download(template: str, request: Request) -> Response:
     request.scope["state"]["route"] = template  # for the metrics; plain routes leave none in the scope
     here: Services = request.app.state.services
     who: Principal = request.scope["state"]["principal"]
-    found = await here.hot.find(request, here, who)
+    for _ in range(LOST_ATTEMPTS):
+        try:
+            return await _answer(request, here, await here.hot.find(request, here, who))
+        except LostMap:  # it left the cache since it was found
+            here.hot.forget(request)
+    raise Unavailable("the map is removed from the cache faster than it is sent: try again in a few seconds")
+
+
+async def _answer(request: Request, here: Services, found: Resource | Started) -> Response:
     if isinstance(found, Started):
         if link_of(request) is not None:  # its holder has no token to follow a job with
             raise Unavailable("the map is still being converted: try again in a few seconds")
@@ -550,7 +564,10 @@ async def _from_disk(request: Request, found: Resource) -> Response:
     status = 206 if part else 200
     if head_only:
         return _response(status, headers)
-    file = await run_in_threadpool(found.file.path.open, "rb")
+    try:
+        file = await run_in_threadpool(found.file.path.open, "rb")
+    except OSError as error:
+        raise found.file.lost(error) from error
     return streamed(file, start, end, status, headers, None if part else found.file.check)
 
 

@@ -110,8 +110,8 @@ def build(app: FastAPI) -> dict[str, Any]:
     }
     _map_paths(schema["paths"])
     for path, operations in schema["paths"].items():
-        for operation in operations.values():
-            _finish(path, operation)
+        for method, operation in operations.items():
+            _finish(path, method, operation)
     schema["tags"] = [
         {"name": name, "description": text}
         for name, text in (
@@ -132,6 +132,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("templates", "What is filled in where a format asks for more than the layers have."),
             ("formats", "What can be read, served and converted."),
             ("jobs", "Work that takes long."),
+            ("stored data", "Healing from another server."),
             ("tokens", "Access."),
             ("health", "Operation."),
         )
@@ -139,7 +140,7 @@ def build(app: FastAPI) -> dict[str, Any]:
     return schema
 
 
-def _finish(path: str, operation: dict[str, Any]) -> None:
+def _finish(path: str, method: str, operation: dict[str, Any]) -> None:
     """The problems that every call can meet, and the token."""
     operation.pop("x-free-query", None)
     problem = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
@@ -155,6 +156,8 @@ def _finish(path: str, operation: dict[str, Any]) -> None:
         }
         common["422"] = "A parameter, the body or a file cannot be used; `errors` says where."
         common["503"] = "Too busy, or a part of the server does not answer: try again after `Retry-After` seconds."
+        if method != "get":
+            common["507"] = "The server's disk is full, and nothing was stored: try again once its operator made room."
     if "requestBody" in operation:
         common |= {
             "400": "The body is malformed.",

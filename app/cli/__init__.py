@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from app import __version__
-from app.cli import agent, align, generate, history, maps, output, position, serving, templates, tokens
+from app.cli import agent, align, generate, history, maps, output, position, serving, templates, tokens, verify
 from app.cli.client import Refused
 from app.errors import FleetMapError
 
@@ -104,6 +104,7 @@ def build(*, all_flags: bool = True) -> typer.Typer:
         ("agent", agent.agent),
         ("agent-level", agent.agent_level),
         ("migrate", serving.migrate),
+        ("verify", verify.verify),
         ("demo", serving.demo),
     ):
         app.command(name)(function)

@@ -23,7 +23,7 @@ import typer
 
 from app.cli import local, options, output
 from app.cli.client import Client, Refused
-from app.errors import FleetMapError, Unavailable
+from app.errors import FleetMapError, NoRoom, Unavailable
 
 if TYPE_CHECKING:
     from app.config import Settings
@@ -236,6 +236,10 @@ def check(settings: Settings) -> None:
         if settings.database.startswith("sqlite"):
             store.migrate()
         store.check()
+        try:
+            store.check_writable()
+        except NoRoom as error:  # maps are served all the same
+            output.say(error.detail, style="yellow")
 
 
 def with_demo_token(settings: Settings) -> Settings:

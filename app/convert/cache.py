@@ -16,7 +16,9 @@ import errno
 import fcntl
 import hashlib
 import logging
+import math
 import os
+import random
 import shutil
 import threading
 import time
@@ -140,17 +142,18 @@ ABANDONED_SECONDS = 3600.0
 class Cache:
     """At most ``limit`` bytes of made maps; the longest unused go first. damaged: how many entries were found bad.
 
-    problem: why maps are not kept on disk at the moment, None where they are.
+    on_damage: called for each of them. problem: why maps are not kept on disk at the moment, None where they are.
     """
 
     def __init__(self, folder: Path, limit: int) -> None:
         self._folder, self._limit = folder, limit
         self._locks: dict[str, threading.Lock] = {}
         self._guard = threading.Lock()
-        self._checked: OrderedDict[str, tuple[int, int]] = OrderedDict()
+        self._checked: OrderedDict[str, tuple[int, int, int]] = OrderedDict()
         self._spare: OrderedDict[str, Made] = OrderedDict()
         self._syncing: ThreadPoolExecutor | None = None
         self.hits = self.misses = self.damaged = 0
+        self.on_damage: Callable[[], None] = lambda: None
         self.problem: str | None = None
         try:
             (folder / "locks").mkdir(parents=True, exist_ok=True)
@@ -190,9 +193,11 @@ class Cache:
                 os.utime(folder)
         return made
 
-    def _read_entry(self, key: str) -> tuple[Made, tuple[int, int]] | None:
-        """What ``map.json`` describes, and a stamp that changes when any of its files is written to; None where it is
-        absent or not intact."""
+    def _read_entry(self, key: str) -> tuple[Made, tuple[int, int, int]] | None:
+        """What ``map.json`` describes; None where it is absent or not intact.
+
+        The stamp with it changes when any of its files is written to or lost.
+        """
         folder = self._path(key)
         try:
             with (folder / "map.json").open("rb") as file:
@@ -211,9 +216,10 @@ class Cache:
         files = tuple(_described(folder, f, damaged) for f in described["files"])
         archive = _described(folder, described["archive"], damaged) if described["archive"] else None
         made = Made(files, archive, described["report"])
-        return made, (status.st_ino, max([status.st_mtime_ns, *(_written(file) for file in made.every())]))
+        times = [status.st_mtime_ns, *(_written(file) for file in made.every())]
+        return made, (status.st_ino, min(times), max(times))
 
-    def _note_checked(self, key: str, stamp: tuple[int, int]) -> None:
+    def _note_checked(self, key: str, stamp: tuple[int, int, int]) -> None:
         with self._guard:
             self._checked[key] = stamp
             while len(self._checked) > MAX_CHECKED:
@@ -225,6 +231,7 @@ class Cache:
             self._checked.pop(key, None)
         if reason is not None:
             self.damaged += 1
+            self.on_damage()
             log.warning("cache: a map is damaged and will be made again (key=%s, reason=%s)", key[:16], reason)
         self._remove(self._path(key))
 
@@ -252,6 +259,12 @@ class Cache:
             return 0, self.damaged == before
         self._note_checked(key, stamp)
         return sum(f.size for f in made.every()), True
+
+    def sample(self, share: float) -> Iterator[tuple[str, int, bool]]:
+        """Hash some of the entries, chosen at random: (key, bytes, whether it was intact)."""
+        keys = self.stored_keys()
+        for key in random.sample(keys, math.ceil(len(keys) * share)):
+            yield key, *self.check(key)
 
     def get_or_make(self, key: str, maker: Callable[[], Product]) -> Made:
         """The map; made now if nobody has, and then by one caller only."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import exc
 
 from app.errors import Unavailable
-from app.store.database import Database, translated
+from app.store.database import Database
 from app.store.tables import metadata
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def upgrade(database: Database) -> None:
     from alembic.util import CommandError
 
     settings = config()
-    with translated(), database.engine.connect() as connection:
+    with database.connected() as connection:
         connection.execution_options(write=True)
         try:
             with connection.begin():
@@ -83,7 +83,7 @@ def check(database: Database) -> None:
     from alembic.script import ScriptDirectory
 
     newest = ScriptDirectory.from_config(config()).get_current_head()
-    with translated(), database.engine.connect() as connection:
+    with database.connected() as connection:
         present = MigrationContext.configure(connection).get_current_revision()
     if present != newest:
         raise Unavailable(

@@ -64,6 +64,7 @@ def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
         "/api/v1/robots": "get", "/api/v1/robots/{robot}": "get delete", "/api/v1/robots/{robot}/status": "put",
         "/api/v1/jobs/{id}": "get delete", "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete",
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
+        "/api/v1/stored/{kind}/{sha256}": "get",
     }  # fmt: skip
     assert {path: " ".join(sorted(item, key=["get", "post", "put", "patch", "delete"].index))
             for path, item in schema["paths"].items()} == wanted  # fmt: skip
@@ -169,6 +170,7 @@ def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -
     known: dict[str, str] = {}
     job = api.app.state.services.store.create_job(owner="", detail="an example")
     known["/api/v1/jobs/{id}"] = job.id
+    known["/api/v1/stored/{kind}/{sha256}"] = api.app.state.services.store.blobs.put(b"an example")
     found = operations(schema)
     found.sort(key=lambda o: (LAST.index(_name(o)) if _name(o) in LAST else -1, ORDER.index(o[1])))
     ran = 0
