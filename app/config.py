@@ -122,6 +122,16 @@ class Settings(BaseSettings):
         default=128 * 2**20, ge=0, description="Room for finished maps in the memory of each worker."
     )
 
+    scrub_hours: float = Field(
+        default=168.0,
+        ge=0,
+        le=8760,
+        description="How often everything stored is hashed again in the background, to find damage early; 0: never.",
+    )
+    scrub_bytes_per_second: int = Field(
+        default=4 * 2**20, ge=1024, description="How fast that goes, so that it disturbs nobody."
+    )
+
     max_uploads: int = Field(
         default=8, ge=1, le=1000, description="Uploads that one worker takes in at once; further ones are answered 503."
     )

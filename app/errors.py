@@ -5,9 +5,13 @@ Every error says in ``detail`` what went wrong and what the user can do about it
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
+
+NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""What writing fails with where the disk is full, or a quota or the process's limit is reached."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +135,14 @@ class ExpiredLink(Denied):
 
 class Unavailable(FleetMapError):
     """Not now: too much work, a store that does not answer. Trying again later may help."""
+
+
+class NoRoom(Unavailable):
+    """The server's disk is full: nothing can be stored, what is stored can be read."""
+
+
+class DatabaseDamaged(Unavailable):
+    """The database itself is malformed, missing or was replaced: an operator must act."""
 
 
 class Damaged(FleetMapError):

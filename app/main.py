@@ -11,7 +11,7 @@ import os
 import shutil
 import sys
 import threading
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -49,6 +49,7 @@ from app.api import (
     provenance,
     robots,
     ros2,
+    stored,
     templates,
     tokens,
     transform,
@@ -69,7 +70,7 @@ from app.api.signed import SignedLinks
 from app.api.uploads import Intake
 from app.config import Settings
 from app.convert import Maps
-from app.errors import Conflict, FleetMapError, Unavailable
+from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable
 from app.events import bus
 from app.events.bus import Bus, BusOptions
 from app.events.login import Login
@@ -85,6 +86,7 @@ from app.pool import Pool
 from app.sandbox import Allowed
 from app.signing import Keys
 from app.store import Store
+from app.store.scrub import Scrub
 
 log = logging.getLogger(__name__)
 
@@ -97,6 +99,9 @@ CLOCK_TOLERANCE = timedelta(seconds=60)
 COLLECT_EVERY = timedelta(hours=24)
 COLLECT_GRACE = timedelta(hours=6)
 """Data that nothing refers to is removed once a day, unless it is younger than this (an upload may be using it)."""
+
+CACHE_SHARE = 0.1
+"""Of the cached maps a scrub hashes so many: each is hashed anyway when a process first meets it."""
 
 WARM = ("app.ingest.prepare", "app.convert.warm")
 """What worker processes need, and the server for its first coverage table."""
@@ -114,6 +119,7 @@ def create_app(settings: Settings) -> Server:
         threading.Thread(target=_prepare, args=(here,), daemon=True).start()
         publishing = [p for p in (ros2_of(settings, here), relay_of(settings, here)) if p is not None]
         app.hot = here.hot
+        scrub = scrub_of(settings, here)
         ticker = asyncio.create_task(_tick(here))
         try:
             yield
@@ -122,6 +128,8 @@ def create_app(settings: Settings) -> Server:
             ticker.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await ticker
+            if scrub is not None:
+                await run_in_threadpool(scrub.close)
             for one in publishing:
                 await run_in_threadpool(one.close)
             await run_in_threadpool(close_services, here)
@@ -165,6 +173,7 @@ def create_app(settings: Settings) -> Server:
         overlays,
         vda5050,
         jobs,
+        stored,
         tokens,
         audit,
     ):
@@ -246,7 +255,11 @@ def open_services(settings: Settings) -> Services:
                     "" if settings.database.startswith("sqlite") else " (`fleetmap migrate` makes the schema current)"
                 )
                 raise Unavailable(error.detail + hint) from error
-            store.recover()
+            try:
+                store.check_writable()
+                store.recover()
+            except NoRoom as error:  # maps are served all the same
+                log.error("%s", error.detail)  # noqa: TRY400  a trace shows paths
             if not settings.insecure_no_auth:
                 _first_token(store, settings)
             intake = Intake(settings.spool_dir, settings.limits, at_once=settings.max_uploads)
@@ -259,7 +272,7 @@ def open_services(settings: Settings) -> Services:
             seconds=settings.max_seconds,
             waiting=settings.conversion_queue,
             warm=WARM,
-            allowed=_allowed(settings),
+            allowed=allowed(settings),
         )
         return _services(settings, store, pool, intake)
     except BaseException:
@@ -269,7 +282,7 @@ def open_services(settings: Settings) -> Services:
         raise
 
 
-def _allowed(settings: Settings) -> Allowed:
+def allowed(settings: Settings) -> Allowed:
     """What worker processes may do: read the database, and nothing else that anybody would notice."""
     if settings.database.startswith("sqlite"):
         file = make_url(settings.database).database
@@ -279,9 +292,22 @@ def _allowed(settings: Settings) -> Allowed:
 
 
 def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> Services:
+    def run(function: Callable[..., Any], *args: Any, **more: Any) -> Any:
+        try:
+            return pool.run(function, *args, **more)
+        except DatabaseDamaged as error:  # a worker met it
+            store.note_damage(error.detail)
+            raise
+
     metrics = Metrics()
-    service = Maps(store, pool.run, settings.cache_dir, settings.limits, cache_bytes=settings.cache_bytes)
+    service = Maps(store, run, settings.cache_dir, settings.limits, cache_bytes=settings.cache_bytes)
+    service.cache.on_damage = metrics.cache_damaged.inc
     access = Access(store.find_token, failures=settings.token_failures, insecure=settings.insecure_no_auth)
+
+    keys, secrets = Keys(settings.data_dir / "keys"), LinkSecrets(settings.data_dir / "keys")
+    with contextlib.suppress(OSError):  # created now, since later the disk may be full
+        keys.public()
+        secrets.newest()
 
     def count(name: str, result: str) -> None:
         metrics.conversions.labels(name, result).inc()
@@ -304,17 +330,15 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         ),
         store=store,
         pool=pool,
-        ingest=Ingest(store, pool.run, settings.limits, provider_of(settings)),
+        ingest=Ingest(store, run, settings.limits, provider_of(settings)),
         maps=service,
         access=access,
         work=Work(store, service, settings.job_seconds, count),
         hot=Hot(settings.memory_cache_bytes, access, metrics, store.generation),
         intake=intake,
         metrics=metrics,
-        keys=Keys(settings.data_dir / "keys"),
-        links=SignedLinks(
-            LinkSecrets(settings.data_dir / "keys"), access, store.environment, int(settings.link_seconds)
-        ),
+        keys=keys,
+        links=SignedLinks(secrets, access, store.environment, int(settings.link_seconds)),
         deltas=Deltas(service.cache),
         fleet=FleetIntake(store, bus_vouches=_bus_vouches(settings)),
     )
@@ -345,6 +369,17 @@ def provider_of(settings: Settings) -> Provider | None:
         cache_dir=settings.data_dir / "imagery" if settings.imagery_cache_bytes else None,
         cache_bytes=settings.imagery_cache_bytes,
     )
+
+
+def scrub_of(settings: Settings, here: Services) -> Scrub | None:
+    """The background check of stored data, begun; None where it is off."""
+    if not settings.scrub_hours:
+        return None
+    sample = partial(here.maps.cache.sample, CACHE_SHARE)
+    rate = settings.scrub_bytes_per_second
+    scrub = Scrub(here.store, sample, every=settings.scrub_hours * 3600, rate=rate)
+    scrub.start()
+    return scrub
 
 
 def relay_of(settings: Settings, here: Services) -> Relay | None:

@@ -11,10 +11,9 @@ import sys
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping
-from pathlib import Path
 
 from app.api.together import Together
-from app.convert.cache import Cache
+from app.convert.cache import Cache, MadeFile
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -40,7 +39,7 @@ class Deltas:
         self._running: Together[tuple[str, str], bytes | None] = Together()
         self._lock = threading.Lock()
 
-    async def between(self, old: str, new: str, body: bytes | Path) -> bytes | None:
+    async def between(self, old: str, new: str, body: bytes | MadeFile) -> bytes | None:
         """``dcz`` of the new file (by its SHA-256) against an old one; None where the old one is not known, or the
         delta is not smaller than the file."""
         key = (old, new)
@@ -50,11 +49,11 @@ class Deltas:
                 return self._known[key]
         return await self._running.run(key, self._between, key, body)
 
-    def _between(self, key: tuple[str, str], body: bytes | Path) -> bytes | None:
+    def _between(self, key: tuple[str, str], body: bytes | MadeFile) -> bytes | None:
         before = self._cache.by_hash(key[0], MAX_BYTES)
         if before is None:
             return None  # not remembered: it may be made (again) at any moment, and anybody can ask for any hash
-        made = _smaller(before, body if isinstance(body, bytes) else body.read_bytes(), bytes.fromhex(key[0]))
+        made = _smaller(before, body if isinstance(body, bytes) else body.read(), bytes.fromhex(key[0]))
         with self._lock:
             self._known[key] = made
             self._size += len(made or b"") + 200

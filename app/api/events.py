@@ -307,7 +307,7 @@ def _locate(here: Services, parameters: Mapping[str, str]) -> Answer:
 def _answer_of(found: MadeFile, most: int) -> Answer:
     if found.size > most:
         raise TooLarge(f"the map has {found.size} bytes, more than is sent over Zenoh ({most}): fetch it over HTTP")
-    return Answer(found.path.read_bytes(), found.media_type)
+    return Answer(found.read(), found.media_type)
 
 
 def _no_parameters(parameters: Mapping[str, Any]) -> None:

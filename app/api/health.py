@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import re
+from typing import Literal
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
@@ -58,10 +59,17 @@ async def healthz() -> Response:
     return answer({"status": "ok"})
 
 
-@router.get("/readyz", responses=told(None, 503), summary="Ready")
-async def readyz(request: Request) -> Response:
-    """Whether database and file store answer and the schema is this release's.
+@router.get("/readyz", responses=told(None, 422, 503), summary="Ready")
+async def readyz(
+    request: Request,
+    for_: Literal["reads", "writes"] = Query(
+        "reads", alias="for", description="What has to work: `writes` also wants room on the disk."
+    ),
+) -> Response:
+    """Whether the database answers, is whole as far as is known, and has this release's schema.
 
+    `status` is `ready`, or `read-only` where maps are served and nothing can be stored: `writes` then says why, and
+    `?for=writes` answers 503. `cache` says why maps are not kept on disk at the moment.
     It also tells whether events go out over Zenoh, and where a robot finds the router (`events.connect`,
     `events.prefix`); where they do not, maps are served all the same. Where maps go out to ROS 2, `ros2` tells how many
     topics there are.
@@ -70,8 +78,11 @@ async def readyz(request: Request) -> Response:
     try:
         async with asyncio.timeout(READY_SECONDS):
             await run_in_threadpool(here.store.check)
+            refusal = await run_in_threadpool(_refusal, here)
     except TimeoutError:
         raise Unavailable(f"database or file store did not answer within {READY_SECONDS:g} seconds") from None
+    if refusal is not None and for_ == "writes":
+        raise Unavailable(f"nothing can be stored: {refusal}")
     if not here.prepared.is_set():
         raise Unavailable("conversions are being prepared: ready in a few seconds")
     events = state_of(here.options.data_dir, here.options.zenoh_mode)
@@ -80,7 +91,25 @@ async def readyz(request: Request) -> Response:
         where = router_for(options.zenoh_advertise, options.zenoh_listen, request.url.hostname or "")
         events = {**events, "prefix": options.zenoh_prefix, **({"connect": where} if where else {})}
     topics = {"ros2": ros2.state_of(here.options.data_dir)} if here.options.ros2 else {}
-    return answer({"status": "ready", "database": "ok", "blobs": "ok", "events": events, **topics})
+    state = {
+        "status": "ready" if refusal is None else "read-only",
+        "database": "ok",
+        "blobs": "ok" if refusal is None else "read-only",
+        "reads": "ok",
+        "writes": refusal or "ok",
+        "cache": here.maps.cache.problem or "ok",
+    }
+    return answer({**state, "events": events, **topics})
+
+
+def _refusal(here: Services) -> str | None:
+    """Why nothing can be stored at the moment, None where it can."""
+    try:
+        here.store.check_writable()
+        here.intake.check()
+    except Unavailable as error:
+        return error.detail
+    return None
 
 
 @router.get(

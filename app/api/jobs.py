@@ -23,7 +23,7 @@ from app.api.schemas import JobOut, JobPath, Limit, told
 from app.api.services import Here
 from app.convert import Maps, Recipe
 from app.convert.cache import Made
-from app.errors import FleetMapError, NotFound, Unavailable
+from app.errors import FleetMapError, NoRoom, NotFound, Unavailable
 from app.pool import Cancelled, Stop
 from app.store import Store
 from app.store.values import Job, State, rfc3339
@@ -83,7 +83,10 @@ class Work:
             known = running.jobs.get(who.id)
             if known is not None:
                 return Started(await run_in_threadpool(self._store.job, known))
-            return Started(await self._as_job(recipe, running, who, address))
+            try:
+                return Started(await self._as_job(recipe, running, who, address))
+            except NoRoom:  # nowhere to note a job: the answer waits for the map
+                return await asyncio.shield(running.future)
         finally:
             with self._lock:
                 running.asking -= 1

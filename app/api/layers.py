@@ -308,7 +308,7 @@ def _voxels(here: Services, version: Version, key: PartKey, box: Box | None, acc
         if column is not None:
             wanted["bbox"] = ",".join(map(repr, column))
         made = here.maps.make(here.maps.recipe(version, "octomap", wanted))
-        return Response(made.whole().path.read_bytes(), media_type=kind)
+        return Response(made.whole().read(), media_type=kind)
     part = here.store.load(version, [key]).parts[key]
     assert isinstance(part, VoxelMap)
     if column is not None:

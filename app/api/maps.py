@@ -7,6 +7,8 @@ way: guard, route, recipe (the ETag), cache on disk, conversion.
 
 from __future__ import annotations
 
+import hashlib
+import itertools
 import re
 import threading
 import time
@@ -14,7 +16,6 @@ from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, BinaryIO, ParamSpec, TypeVar
 from urllib.parse import parse_qsl, quote, urlencode
 
@@ -37,7 +38,7 @@ from app.api.services import Here, Services
 from app.api.signed import LINK
 from app.api.together import Together
 from app.convert import Recipe
-from app.convert.cache import Made, MadeFile
+from app.convert.cache import LostMap, Made, MadeFile
 from app.convert.maps import file_of
 from app.errors import CannotDerive, Invalid, NotFound, Problem, Unavailable
 from app.links import SignedAddress
@@ -45,6 +46,9 @@ from app.model.closures import CLOSURE_MODES, ClosureMode
 from app.store.values import LATEST, Version
 
 FRESH_SECONDS = 1.0
+LOST_ATTEMPTS = 5
+"""How often a map is made again that was lost from the cache before it was read."""
+
 IN_MEMORY = 8 * 2**20
 """Files up to this many bytes are answered from memory; larger ones are streamed from disk."""
 
@@ -76,7 +80,8 @@ class Wanted:
 @dataclass(frozen=True, slots=True, eq=False)
 class Resource:
     """What stands at an address. recipe: None where it is no map. body: None while it is not made, or too large for
-    memory; path: then its file. link_expires: seconds since 1970, of a signed link; None where a token is needed.
+    memory; file: then the one on disk. link_expires: seconds since 1970, of a signed link; None where a token is
+    needed.
     """
 
     wanted: Wanted
@@ -87,7 +92,7 @@ class Resource:
     bare: Headers
     size: int
     body: bytes | None
-    path: Path | None
+    file: MadeFile | None
     sha256: str
     generation: int
     fresh_until: float
@@ -117,14 +122,14 @@ class Hot:
         """What stands at the request's address; made where need be, or the job that makes it."""
         key = _key(request)
         fresh = self.get(key)
-        if fresh is not None and (fresh.body is not None or fresh.path is not None):
+        if fresh is not None and (fresh.body is not None or fresh.file is not None):
             return fresh
         link = link_of(request)
         values, derive, closures = _options(key[1] if link is None else link.query)
         wanted = replace(wanted_of(request), closures=closures)
         # Taken before anything is read: a commit in between makes this answer stale, never fresh.
         generation, until = self.generation(), time.monotonic() + FRESH_SECONDS
-        while True:
+        for attempt in itertools.count():
             recipe = await self.shared(request, _resolve, here, wanted, values, derive)
             old = self._entries.get(key)
             if old is not None and old.recipe is not None and _same(old.recipe, recipe) and old.body is not None:
@@ -138,17 +143,24 @@ class Hot:
                 self._put(key, empty)
                 return empty
             # From here on the recipe says what is meant: who was told of a later commit has another one.
-            made: Resource | None = await self._looks.run((key, _meant(recipe), "ready"), self._ready, here, key, empty)
-            if made is not None:
-                return made
             try:
+                made: Resource | None = await self._looks.run(
+                    (key, _meant(recipe), "ready"), self._ready, here, key, empty
+                )
+                if made is not None:
+                    return made
                 outcome = await here.work.make(recipe, who, address_of(request))
+                if isinstance(outcome, Started):
+                    return outcome
+                made = await self._looks.run((key, _meant(recipe), "fill"), self._fill, key, empty, outcome)
             except CannotDerive:
                 continue  # it is remembered: the next recipe goes another way, or says that there is none
-            if isinstance(outcome, Started):
-                return outcome
-            full: Resource = await self._looks.run((key, _meant(recipe), "fill"), self._fill, key, empty, outcome)
-            return full
+            except LostMap:  # damaged or evicted while it was read: it is made again
+                if attempt >= LOST_ATTEMPTS:
+                    raise
+                continue
+            return made
+        raise AssertionError("unreachable")
 
     def _ready(self, here: Services, key: Key, empty: Resource) -> Resource | None:
         assert empty.recipe is not None
@@ -221,6 +233,12 @@ class Hot:
             ),
         )
 
+    def forget(self, request: Request) -> None:
+        """Drop what is remembered of an address."""
+        with self._lock:
+            old = self._entries.pop(_key(request), None)
+            self._size -= _weight(old) if old else 0
+
     def count(self) -> None:
         """Add what was answered from memory since the last call to the metrics."""
         for route, tally in list(self._tallies.items()):
@@ -265,8 +283,6 @@ def _weight(resource: Resource) -> int:
 
 
 def _file_etag(recipe: Recipe, name: str) -> str:
-    import hashlib
-
     return f'{recipe.etag[:-1]}-{hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]}"'
 
 
@@ -318,9 +334,9 @@ def _filled(empty: Resource, made: Made) -> Resource:
         *empty.headers,
         (b"use-as-dictionary", _dictionary(empty.wanted).encode()),
     ]
-    if file.size > IN_MEMORY:
-        return replace(empty, headers=headers, size=file.size, path=file.path, sha256=file.sha256)
-    body = file.path.read_bytes()
+    if file.size > IN_MEMORY and file.path is not None:
+        return replace(empty, headers=headers, size=file.size, file=file, sha256=file.sha256)
+    body = file.read()
     headers.insert(0, (b"content-length", str(len(body)).encode()))
     return replace(empty, headers=headers, size=len(body), body=body, sha256=file.sha256)
 
@@ -470,7 +486,15 @@ async def download(template: str, request: Request) -> Response:
     request.scope["state"]["route"] = template  # for the metrics; plain routes leave none in the scope
     here: Services = request.app.state.services
     who: Principal = request.scope["state"]["principal"]
-    found = await here.hot.find(request, here, who)
+    for _ in range(LOST_ATTEMPTS):
+        try:
+            return await _answer(request, here, await here.hot.find(request, here, who))
+        except LostMap:  # it left the cache since it was found
+            here.hot.forget(request)
+    raise Unavailable("the map is removed from the cache faster than it is sent: try again in a few seconds")
+
+
+async def _answer(request: Request, here: Services, found: Resource | Started) -> Response:
     if isinstance(found, Started):
         if link_of(request) is not None:  # its holder has no token to follow a job with
             raise Unavailable("the map is still being converted: try again in a few seconds")
@@ -480,7 +504,7 @@ async def download(template: str, request: Request) -> Response:
     delta = await _delta(request, here, found)
     if delta is not None:
         return delta
-    if found.path is not None:
+    if found.file is not None:
         return await _from_disk(request, found)
     body = found.body or b""
     part = byte_range(request.headers.get("range"), request.headers.get("if-range"), found.etag, found.size)
@@ -496,7 +520,7 @@ async def _delta(request: Request, here: Services, found: Resource) -> Response 
     old = deltas.wanted(request.headers)
     if old is None or "range" in request.headers or found.size > deltas.MAX_BYTES:
         return None
-    content = found.body if found.body is not None else found.path
+    content = found.body if found.body is not None else found.file
     if content is None:
         return None
     made = await here.deltas.between(old, found.sha256, content)
@@ -532,7 +556,8 @@ def _partial_headers(found: Resource, part: tuple[int, int]) -> Headers:
 
 async def _from_disk(request: Request, found: Resource) -> Response:
     """A large file, in chunks. It is opened before the answer starts, so the cache may drop it meanwhile."""
-    assert found.path is not None
+    assert found.file is not None
+    assert found.file.path is not None
     part = byte_range(request.headers.get("range"), request.headers.get("if-range"), found.etag, found.size)
     if isinstance(part, Unsatisfiable):
         raise _unsatisfiable(found.size)
@@ -542,22 +567,40 @@ async def _from_disk(request: Request, found: Resource) -> Response:
     status = 206 if part else 200
     if head_only:
         return _response(status, headers)
-    file = await run_in_threadpool(found.path.open, "rb")
-    return streamed(file, start, end, status, headers)
+    try:
+        file = await run_in_threadpool(found.file.path.open, "rb")
+    except OSError as error:
+        raise found.file.lost(error) from error
+    return streamed(file, start, end, status, headers, None if part else found.file.check)
 
 
-def streamed(file: BinaryIO, start: int, end: int, status: int, headers: Headers) -> Response:
-    """The bytes [start, end) of an open file, which is closed at the end."""
+def streamed(
+    file: BinaryIO, start: int, end: int, status: int, headers: Headers, check: Callable[[str], None] | None = None
+) -> Response:
+    """The bytes [start, end) of an open file, which is closed at the end.
+
+    check: called with the hash of all of it before the last bytes are sent; what it raises breaks the connection, so
+    that nobody takes damaged content for whole.
+    """
+    digest = hashlib.sha256()
+
+    def read(size: int) -> bytes:
+        chunk = file.read(size)
+        if check is not None:
+            digest.update(chunk)
+        return chunk
 
     async def chunks() -> AsyncIterator[bytes]:
         try:
             await run_in_threadpool(file.seek, start)
             left = end - start
             while left > 0:
-                chunk = await run_in_threadpool(file.read, min(CHUNK, left))
+                chunk = await run_in_threadpool(read, min(CHUNK, left))
                 if not chunk:
                     raise OSError("a file that is being sent became shorter")
                 left -= len(chunk)
+                if check is not None and not left:
+                    check(digest.hexdigest())
                 yield chunk
         finally:
             file.close()

@@ -6,14 +6,17 @@ With several worker processes prometheus_client keeps the counters in files (``P
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterable
+from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest, multiprocess
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from app.store import Store
+from app.store.scrub import figures, read_state
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 MAX_HEADS = 10_000
@@ -38,7 +41,21 @@ class Metrics:
         hits = Counter("fleetmap_cache_hits", "Maps answered without making them.", ["cache"], registry=self.registry)
         self.memory_hits = hits.labels("memory")
         self.disk_hits = hits.labels("disk")
+        self.cache_damaged = Counter(
+            "fleetmap_cache_damaged", "Cached maps found damaged, and made again.", registry=self.registry
+        )
         self.uploads = Counter("fleetmap_uploads", "Uploads and edits.", ["result"], registry=self.registry)
+
+        self._reserve()
+
+    def _reserve(self) -> None:
+        """Take the room of this process's shared counters now: touching a hole on a full disk would kill it."""
+        folder = os.environ.get("PROMETHEUS_MULTIPROC_DIR")
+        if folder:
+            self.seconds.labels("other")  # makes the histograms' file
+            for path in Path(folder).glob(f"*_{os.getpid()}.db"):
+                with contextlib.suppress(OSError), path.open("r+b") as file:
+                    os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
 
     def render(self, store: Store) -> bytes:
         """The text that Prometheus reads."""
@@ -48,6 +65,7 @@ class Metrics:
             multiprocess.MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
         heads = CollectorRegistry()
         heads.register(_Heads(store))
+        heads.register(_Scrubs(store))
         return generate_latest(registry) + generate_latest(heads)
 
 
@@ -69,3 +87,20 @@ class _Heads(Collector):
                 break
         yield heads
         yield GaugeMetricFamily("fleetmap_environments", "Environments that are not deleted.", value=count)
+
+
+class _Scrubs(Collector):
+    """When stored data was last hashed as a whole, and what of it was damaged."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def collect(self) -> Iterable[Metric]:
+        state = figures(read_state(self._store.blob_dir))
+        age = "Seconds since the last complete check of all stored data; +Inf where there was none yet."
+        yield GaugeMetricFamily("fleetmap_scrub_age_seconds", age, value=state["age"])
+        yield GaugeMetricFamily("fleetmap_scrub_running", "Whether such a check is under way.", value=state["running"])
+        findings = GaugeMetricFamily("fleetmap_scrub_findings", "Damaged things it found, by kind.", labels=["kind"])
+        for kind, count in state["findings"].items():
+            findings.add_metric([kind], count)
+        yield findings

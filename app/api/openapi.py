@@ -129,8 +129,8 @@ def build(app: FastAPI) -> dict[str, Any]:
     }
     _map_paths(schema["paths"])
     for path, operations in schema["paths"].items():
-        for operation in operations.values():
-            _finish(path, operation)
+        for method, operation in operations.items():
+            _finish(path, method, operation)
     schema["tags"] = [
         {"name": name, "description": text}
         for name, text in (
@@ -153,6 +153,7 @@ def build(app: FastAPI) -> dict[str, Any]:
             ("templates", "What is filled in where a format asks for more than the layers have."),
             ("formats", "What can be read, served and converted."),
             ("jobs", "Work that takes long."),
+            ("stored data", "Healing from another server."),
             ("tokens", "Access."),
             ("audit", "Who changed what, from where."),
             ("health", "Operation."),
@@ -161,7 +162,7 @@ def build(app: FastAPI) -> dict[str, Any]:
     return schema
 
 
-def _finish(path: str, operation: dict[str, Any]) -> None:
+def _finish(path: str, method: str, operation: dict[str, Any]) -> None:
     """The problems that every call can meet, and the token."""
     operation.pop("x-free-query", None)
     problem = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
@@ -177,6 +178,8 @@ def _finish(path: str, operation: dict[str, Any]) -> None:
         }
         common["422"] = "A parameter, the body or a file cannot be used; `errors` says where."
         common["503"] = "Too busy, or a part of the server does not answer: try again after `Retry-After` seconds."
+        if method != "get":
+            common["507"] = "The server's disk is full, and nothing was stored: try again once its operator made room."
     if "requestBody" in operation:
         common |= {
             "400": "The body is malformed.",
@@ -232,8 +235,8 @@ def _map_paths(paths: dict[str, Any]) -> None:
     for known in formats.all_formats().values():
         if known.write is None:
             continue
-        names = {"env", "derive", "closures", *(p["name"] for p in _header_parameters())}
-        common = [p for p in short["parameters"] if p["name"] in names]
+        wanted = {"env", "derive", "closures", *(p["name"] for p in _header_parameters())}
+        common = [p for p in short["parameters"] if p["name"] in wanted]
         paths[f"/maps/{{env}}/{known.name}"] = {
             "get": {
                 **short,

@@ -310,4 +310,4 @@ async def _marked(
 
 
 def _files(made: Made) -> dict[str, bytes]:
-    return {file.name: file.path.read_bytes() for file in made.files}
+    return {file.name: file.read() for file in made.files}

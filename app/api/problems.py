@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import errno
 import logging
+import threading
+import time
 import traceback
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
@@ -75,6 +77,8 @@ STATUS: Mapping[type[errors.FleetMapError], tuple[int, str]] = {
     errors.Unauthenticated: (401, "Token needed"),
     errors.InvalidLink: (403, "Invalid link"),
     errors.ExpiredLink: (403, "Expired link"),
+    errors.NoRoom: (507, "No room left"),
+    errors.DatabaseDamaged: (503, "Database damaged"),
     errors.Unavailable: (503, "Unavailable"),
     errors.Damaged: (500, "Damaged data"),
     errors.Untrusted: (500, "Not to be trusted"),
@@ -82,7 +86,12 @@ STATUS: Mapping[type[errors.FleetMapError], tuple[int, str]] = {
 """Class -> status and title; a class that is not listed takes its nearest base's."""
 
 RETRY_SECONDS = 5
+NO_ROOM_RETRY_SECONDS = 60
+ALARM_SECONDS = 3600.0
+"""How often the same alarm is logged, however many requests meet it."""
+
 MAX_ERRORS = 100
+MAX_ALARMS = 1000
 
 
 def status_of(error: errors.FleetMapError) -> tuple[int, str, str]:
@@ -153,10 +162,29 @@ def of_error(error: errors.FleetMapError) -> Response:
         headers["retry-after"] = str(error.retry_after)
     elif status == 503:
         headers["retry-after"] = str(RETRY_SECONDS)
-    if isinstance(error, errors.Damaged):
+    elif status == 507:
+        headers["retry-after"] = str(NO_ROOM_RETRY_SECONDS)
+    if isinstance(error, errors.Damaged | errors.NoRoom) and _is_news(error.detail):
         # The operator's alarm; the client learns only that it was not its fault.
-        log.critical("stored data is damaged: %s", error.detail)
+        what = "stored data is damaged" if isinstance(error, errors.Damaged) else "no room left on the server's disk"
+        log.critical("%s: %s", what, error.detail)
     return problem(status, error.detail, title=title, type_=type_, problems=error.problems, headers=headers)
+
+
+_alarms: dict[str, float] = {}
+_alarms_lock = threading.Lock()
+
+
+def _is_news(detail: str) -> bool:
+    """Whether an alarm was not logged within the last hour."""
+    now = time.monotonic()
+    with _alarms_lock:
+        for text in [text for text, since in _alarms.items() if now - since > ALARM_SECONDS]:
+            del _alarms[text]
+        if detail in _alarms or len(_alarms) >= MAX_ALARMS:
+            return False
+        _alarms[detail] = now
+        return True
 
 
 def body_of(error: Exception) -> bytes:
@@ -201,13 +229,11 @@ def of_validation(error: RequestValidationError) -> Response:
 
 def of_bug(error: BaseException) -> Response:
     """The answer for anything else. The log gets the class and our own lines, no data, paths or tokens."""
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        log.critical("no room left on the server's disk")
-        return problem(
-            507,
-            "the server has no room left; nothing was stored. Try again once its operator has made room",
-            headers={"retry-after": "60"},
-        )
+    if isinstance(error, OSError) and error.errno in errors.NO_ROOM:
+        detail = "the server has no room left; nothing was stored. Try again once its operator has made room"
+        return of_error(errors.NoRoom(detail))
+    if isinstance(error, OSError) and error.errno == errno.EROFS:
+        return of_error(errors.Unavailable("the server's disk is read-only; nothing was stored. Try again later"))
     log.error("internal error: %s", describe(error))
     return problem(500, "the server made a mistake; its log says where. Nothing was stored", title="Internal error")
 

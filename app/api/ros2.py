@@ -84,7 +84,7 @@ def _grids(version: Version, derive: bool) -> list[dict[str, str]]:
 
 def _grid(here: Services, version: Version, values: Mapping[str, str], derive: bool) -> cdr.Grid:
     made = here.maps.at_once(version, "occupancy_grid", values, derive=derive)
-    files = {file.name: file.path.read_bytes() for file in made.files}
+    files = {file.name: file.read() for file in made.files}
     known = formats.get_format("occupancy_grid")
     assert known.read is not None
     read = known.read(files, ReadContext(here.options.limits, main=made.files[0].name))
@@ -97,5 +97,5 @@ def _grid(here: Services, version: Version, values: Mapping[str, str], derive: b
 def _network(here: Services, version: Version, derive: bool) -> str:
     """The tmap2 as JSON: topological_navigation publishes it so, and who reads YAML reads JSON."""
     made = here.maps.at_once(version, "tmap2", {}, derive=derive)
-    document = _yaml.load(made.files[0].path.read_bytes(), here.options.limits)
+    document = _yaml.load(made.files[0].read(), here.options.limits)
     return json.dumps(document, ensure_ascii=False)

@@ -26,9 +26,10 @@ from starlette.concurrency import run_in_threadpool
 
 from app.api.guard import multipart_boundary
 from app.api.problems import MalformedBody
-from app.errors import Invalid, Problem, TooLarge, Unavailable
+from app.errors import NO_ROOM, Invalid, NoRoom, Problem, TooLarge, Unavailable
 from app.formats import Limits
 from app.ingest import SpooledFile
+from app.store.database import check_room
 
 BATCH = 2**20
 """Bytes gathered before a thread parses, hashes and writes them."""
@@ -56,17 +57,36 @@ class Intake:
         self._limits, self._at_once = limits, at_once
         self._active = 0
         self._lock = threading.Lock()
-        spool.mkdir(parents=True, exist_ok=True)
-        _remove_left(spool)
         self._folder = spool / uuid4().hex
-        self._folder.mkdir()
-        # Held as long as this process lives: how the next start knows what is left over.
-        self._alive = (self._folder / "alive").open("w")
-        fcntl.flock(self._alive, fcntl.LOCK_EX)
+        self._alive: IO[str] | None = None
+        if spool.is_dir():
+            _remove_left(spool)
+        with contextlib.suppress(OSError):  # a full disk keeps uploads away, not the server from starting
+            self._open()
+
+    def _open(self) -> None:
+        """Make the folder of this process."""
+        with self._lock:
+            if self._alive is None:
+                self._folder.mkdir(parents=True, exist_ok=True)
+                # Held as long as this process lives: how the next start knows what is left over.
+                alive = (self._folder / "alive").open("w")
+                fcntl.flock(alive, fcntl.LOCK_EX)
+                self._alive = alive
+
+    def check(self) -> None:
+        """NoRoom or Unavailable unless an upload could be spooled."""
+        try:
+            self._open()
+            check_room(self._folder)
+        except OSError as error:
+            kind = NoRoom if error.errno in NO_ROOM else Unavailable
+            raise kind(f"the folder for uploads cannot be written: {error.strerror}") from error
 
     def close(self) -> None:
         """Remove the spool of this process."""
-        self._alive.close()
+        if self._alive is not None:
+            self._alive.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     @contextlib.asynccontextmanager
@@ -82,6 +102,7 @@ class Intake:
         folder = self._folder / uuid4().hex
         try:
             boundary = multipart_boundary(request.headers.get("content-type", ""))
+            self._open()
             folder.mkdir()
             receiver = _Receiver(boundary, folder, self._limits)
             try:

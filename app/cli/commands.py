@@ -57,6 +57,7 @@ PANELS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("keys", "keys:commands"),
         ("jobs", "jobs:commands"),
         ("migrate", "serving:migrate"),
+        ("verify", "verify:verify"),
     ),
 }
 """Commands in the order of the help: name, and where its function or group is (below ``app.cli``)."""

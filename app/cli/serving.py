@@ -25,7 +25,7 @@ import typer
 from app.cli import local, options, output, variables
 from app.cli.client import Client
 from app.cli.problems import Refused
-from app.errors import FleetMapError, Unavailable
+from app.errors import FleetMapError, NoRoom, Unavailable
 
 if TYPE_CHECKING:
     from app.config import Settings
@@ -286,6 +286,10 @@ def check(settings: Settings) -> None:
             with _main().alone(settings.data_dir):
                 store.migrate()
         store.check()
+        try:
+            store.check_writable()
+        except NoRoom as error:  # maps are served all the same
+            output.say(error.detail, style="yellow")
 
 
 def with_demo_token(settings: Settings) -> Settings:

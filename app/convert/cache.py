@@ -1,40 +1,98 @@
 """Made maps on disk, keyed by content: one of many askers makes a map, all others wait for it.
 
-A map is a folder ``<key[:2]>/<key>`` with its files and ``map.json``; it appears by a rename, so it is whole or absent.
-A file lock for each key holds across worker processes of the server.
+A map is a folder ``<key[:2]>/<key>`` with its files and ``map.json``, whose first line is the hash of the rest; it
+appears by a rename, so it is whole or absent. A file lock for each key holds across worker processes of the server.
+
+The disk is not trusted. A process hashes an entry when it first meets it, and content again whenever it is read
+(``MadeFile.read``); what does not match is removed and made again. That is why the fsync may come after the rename, in
+the background: an entry that a power cut left half-written never passes the hash. Where the disk refuses (no room,
+read-only), maps are made all the same and kept in memory for a while.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
+import logging
+import math
 import os
+import random
 import shutil
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 import orjson
 
+from app.errors import Unavailable
+
+log = logging.getLogger(__name__)
+
 FRESH_SECONDS = 60.0
 """A map is marked as used at most this often: its age decides what goes when room is needed."""
+
+SPARE_BYTES = 64 * 2**20
+"""Room in memory for maps that the disk refused; the newest stays, whatever its size."""
+
+BROKEN = frozenset({errno.EIO, errno.EBADMSG, errno.EUCLEAN})
+"""What reading damaged storage fails with."""
+
+MAX_CHECKED = 100_000
+"""Entries of which it is remembered that they were hashed."""
+
+
+class LostMap(Unavailable):
+    """A cached map that was damaged or removed while it was read; it is made again when it is requested again."""
 
 
 @dataclass(frozen=True, slots=True)
 class MadeFile:
-    """One file of a made map, on disk. place: the level and name of the part that it is of, in a map of several."""
+    """One file of a made map. place: the level and name of the part that it is of, in a map of several.
+
+    path: None where it is in memory (``data``), since the disk refused it. on_damage: called with what is wrong.
+    """
 
     name: str
     size: int
     sha256: str
     media_type: str
-    path: Path
+    path: Path | None
     place: tuple[str, str] | None = None
+    data: bytes | None = field(default=None, compare=False, repr=False)
+    on_damage: Callable[[str], None] = field(default=lambda _: None, compare=False, repr=False)
+
+    def read(self) -> bytes:
+        """The content, hashed again; LostMap where it is not what was made, or gone."""
+        if self.path is None:
+            return self.data or b""
+        try:
+            data = self.path.read_bytes()
+        except OSError as error:
+            raise self.lost(error) from error
+        self.check(hashlib.sha256(data).hexdigest())
+        return data
+
+    def check(self, sha256: str) -> None:
+        """LostMap unless this is the content's hash."""
+        if sha256 != self.sha256:
+            raise self.lost(None)
+
+    def lost(self, error: OSError | None) -> LostMap:
+        """The error for content that cannot be read (or has another hash), which is reported as damage."""
+        if error is None:
+            self.on_damage(f"{self.name!r} does not match its hash")
+        elif error.errno in BROKEN:  # not where the cache only needed the room
+            self.on_damage(f"{self.name!r} cannot be read: {error.strerror}")
+        return LostMap(f"the cached {self.name!r} was lost while it was read: request it again")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +103,15 @@ class Made:
     archive: MadeFile | None
     report: dict[str, Any]
     fresh: bool = field(default=False, compare=False)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all its files."""
+        return sum(file.size for file in self.every())
+
+    def every(self) -> tuple[MadeFile, ...]:
+        """All files, and the archive of them."""
+        return (*self.files, *([self.archive] if self.archive else []))
 
     def whole(self) -> MadeFile:
         """The file itself where the map is one file, else the zip of all."""
@@ -59,10 +126,10 @@ class Made:
 class Product:
     """What a maker returns: content by name with media types, an archive of it where there are several, the report.
 
-    A path instead of bytes is a file on the cache's disk, which is linked. places: see ``MadeFile.place``.
+    A made file instead of bytes is linked, if its content still has its hash. places: see ``MadeFile.place``.
     """
 
-    files: dict[str, tuple[bytes | Path, str]]
+    files: dict[str, tuple[bytes | MadeFile, str]]
     archive: tuple[str, bytes] | None
     report: dict[str, Any]
     places: Mapping[str, tuple[str, str]] = field(default_factory=dict)
@@ -73,14 +140,25 @@ ABANDONED_SECONDS = 3600.0
 
 
 class Cache:
-    """At most ``limit`` bytes of made maps; the longest unused go first."""
+    """At most ``limit`` bytes of made maps; the longest unused go first. damaged: how many entries were found bad.
+
+    on_damage: called for each of them. problem: why maps are not kept on disk at the moment, None where they are.
+    """
 
     def __init__(self, folder: Path, limit: int) -> None:
         self._folder, self._limit = folder, limit
         self._locks: dict[str, threading.Lock] = {}
         self._guard = threading.Lock()
-        self.hits = self.misses = 0
-        (folder / "locks").mkdir(parents=True, exist_ok=True)
+        self._checked: OrderedDict[str, tuple[int, int, int]] = OrderedDict()
+        self._spare: OrderedDict[str, Made] = OrderedDict()
+        self._syncing: ThreadPoolExecutor | None = None
+        self.hits = self.misses = self.damaged = 0
+        self.on_damage: Callable[[], None] = lambda: None
+        self.problem: str | None = None
+        try:
+            (folder / "locks").mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            self._note_problem(error)
         for old in folder.glob("making-*"):
             with contextlib.suppress(OSError):
                 if time.time() - old.stat().st_mtime > ABANDONED_SECONDS:
@@ -88,17 +166,105 @@ class Cache:
         self._total = sum(size for _, size, _ in self._entries())
 
     def get(self, key: str) -> Made | None:
-        """The map, if it is made."""
-        folder = self._path(key)
-        try:
-            described = orjson.loads((folder / "map.json").read_bytes())
+        """The map, if it is made and intact."""
+        found = self._stored(key)
+        if found is not None:
+            return found
+        with self._guard:
+            return self._spare.get(key)
+
+    def _stored(self, key: str) -> Made | None:
+        """The entry on disk, hashed when this process first meets it; a bad one is removed."""
+        entry = self._read_entry(key)
+        if entry is None:
+            return None
+        made, stamp = entry
+        with self._guard:
+            checked = self._checked.get(key) == stamp
+        if not checked:
+            try:
+                _check_files(made)
+            except LostMap:
+                return None
+            self._note_checked(key, stamp)
+        with contextlib.suppress(OSError):
+            folder = self._path(key)
             if time.time() - folder.stat().st_mtime > FRESH_SECONDS:
                 os.utime(folder)
-        except (OSError, orjson.JSONDecodeError):
+        return made
+
+    def _read_entry(self, key: str) -> tuple[Made, tuple[int, int, int]] | None:
+        """What ``map.json`` describes; None where it is absent or not intact.
+
+        The stamp with it changes when any of its files is written to or lost.
+        """
+        folder = self._path(key)
+        try:
+            with (folder / "map.json").open("rb") as file:
+                status, raw = os.fstat(file.fileno()), file.read()
+        except FileNotFoundError:
             return None
-        files = tuple(_described(folder, f) for f in described["files"])
-        archive = _described(folder, described["archive"]) if described["archive"] else None
-        return Made(files, archive, described["report"])
+        except OSError as error:
+            self.discard(key, f"map.json: {error}")
+            return None
+        line, _, text = raw.partition(b"\n")
+        if line != hashlib.sha256(text).hexdigest().encode() or (described := orjson.loads(text))["key"] != key:
+            earlier = raw.startswith(b"{")  # of an earlier release, which wrote no hash
+            self.discard(key, None if earlier else "map.json does not match its hash")
+            return None
+        damaged = partial(self.discard, key)
+        files = tuple(_described(folder, f, damaged) for f in described["files"])
+        archive = _described(folder, described["archive"], damaged) if described["archive"] else None
+        made = Made(files, archive, described["report"])
+        times = [status.st_mtime_ns, *(_written(file) for file in made.every())]
+        return made, (status.st_ino, min(times), max(times))
+
+    def _note_checked(self, key: str, stamp: tuple[int, int, int]) -> None:
+        with self._guard:
+            self._checked[key] = stamp
+            while len(self._checked) > MAX_CHECKED:
+                self._checked.popitem(last=False)
+
+    def discard(self, key: str, reason: str | None) -> None:
+        """Remove an entry that must not be served. reason: what is wrong with it; None where it is merely outdated."""
+        with self._guard:
+            self._checked.pop(key, None)
+        if reason is not None:
+            self.damaged += 1
+            self.on_damage()
+            log.warning("cache: a map is damaged and will be made again (key=%s, reason=%s)", key[:16], reason)
+        self._remove(self._path(key))
+
+    def _remove(self, folder: Path) -> None:
+        """Remove an entry at once, whole. On a disk that cannot be written it stays, and is hashed again."""
+        away = self._folder / f"making-{uuid4().hex}"
+        with contextlib.suppress(OSError):
+            folder.rename(away)
+        shutil.rmtree(away, ignore_errors=True)
+
+    def stored_keys(self) -> list[str]:
+        """All entries on disk."""
+        return sorted(folder.name for _, _, folder in self._entries())
+
+    def check(self, key: str) -> tuple[int, bool]:
+        """Hash an entry, whatever is known of it: (bytes read, whether it is intact). A bad one is removed."""
+        before = self.damaged
+        entry = self._read_entry(key)
+        if entry is None:
+            return 0, self.damaged == before
+        made, stamp = entry
+        try:
+            _check_files(made)
+        except LostMap:
+            return 0, self.damaged == before
+        self._note_checked(key, stamp)
+        return sum(f.size for f in made.every()), True
+
+    def sample(self, share: float) -> Iterator[tuple[str, int, bool]]:
+        """Hash some of the entries, chosen at random: (key, bytes, whether it was intact)."""
+        keys = self.stored_keys()
+        for key in random.sample(keys, math.ceil(len(keys) * share)):
+            yield key, *self.check(key)
 
     def get_or_make(self, key: str, maker: Callable[[], Product]) -> Made:
         """The map; made now if nobody has, and then by one caller only."""
@@ -118,50 +284,133 @@ class Cache:
     def holding(self) -> Iterator[Callable[[Made], Made]]:
         """A function that keeps a made map's files until the block ends, whatever room the cache needs meanwhile.
 
-        It raises FileNotFoundError where they are gone already.
+        It raises LostMap where they are gone already.
         """
-        folder = self._folder / f"making-{uuid4().hex}"
-        folder.mkdir()
+        folder: Path | None = self._folder / f"making-{uuid4().hex}"
         count = 0
+        try:
+            assert folder is not None
+            folder.mkdir()
+        except OSError as error:
+            self._note_problem(error)
+            folder = None
 
         def hold(made: Made) -> Made:
             nonlocal count
             files = []
             for file in made.files:
                 count += 1
-                _link(file.path, folder / str(count))
-                files.append(replace(file, path=folder / str(count)))
+                if file.path is None:
+                    files.append(file)
+                elif folder is None:
+                    files.append(replace(file, path=None, data=file.read()))
+                else:
+                    try:
+                        _link(file.path, folder / str(count))
+                        files.append(replace(file, path=folder / str(count)))
+                    except FileNotFoundError as error:
+                        raise file.lost(error) from error
+                    except OSError:  # no room for a name
+                        files.append(replace(file, path=None, data=file.read()))
             return replace(made, files=tuple(files), archive=None)
 
         try:
             yield hold
         finally:
-            shutil.rmtree(folder, ignore_errors=True)
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
 
     def _store(self, key: str, product: Product) -> Made:
+        try:
+            made = self._write(key, product)
+        except OSError as error:
+            self._note_problem(error)
+            return self._keep_spare(key, product)
+        self._note_problem(None)
+        for file in made.every():
+            self._note_hash(file)
+        self._total += sum(f.size for f in made.every())
+        if self._total > self._limit:
+            self._make_room()
+        return made
+
+    def _write(self, key: str, product: Product) -> Made:
+        """The entry on disk. OSError where the disk refuses; LostMap where a file of the product is damaged."""
         making = self._folder / f"making-{uuid4().hex}"
         making.mkdir()
         try:
             files = [_write(making, str(k), name, *content) for k, (name, content) in enumerate(product.files.items())]
             files = [{**f, "place": product.places[f["name"]]} if f["name"] in product.places else f for f in files]
             archive = _write(making, "whole", *product.archive, "application/zip") if product.archive else None
-            described = {"files": files, "archive": archive, "report": product.report}
-            (making / "map.json").write_bytes(orjson.dumps(described))
+            text = orjson.dumps({"key": key, "files": files, "archive": archive, "report": product.report})
+            (making / "map.json").write_bytes(hashlib.sha256(text).hexdigest().encode() + b"\n" + text)
             target = self._path(key)
             target.parent.mkdir(exist_ok=True)
-            with contextlib.suppress(OSError):  # another host on the same disk may have been first: equal bytes
+            try:
+                making.rename(target)
+            except OSError:  # another host on the same disk may have been first: equal bytes
+                first = self._stored(key)  # a damaged one is removed by this
+                if first is not None:
+                    return first
+                self._remove(target)  # what was left of an entry
                 making.rename(target)
         finally:
             shutil.rmtree(making, ignore_errors=True)
-        made = self.get(key)
-        if made is None:
+        entry = self._read_entry(key)
+        if entry is None:
             raise OSError(f"the cache folder {self._folder} does not keep what is written to it")
-        for file in (*made.files, *([made.archive] if made.archive else [])):
-            self._note_hash(file)
-        self._total += sum(f.size for f in made.files) + (made.archive.size if made.archive else 0)
-        if self._total > self._limit:
-            self._make_room()
+        made, stamp = entry
+        self._note_checked(key, stamp)  # the hashes are of the bytes as they were made, not as the disk has them
+        self._sync_later(key)
         return made
+
+    def _sync_later(self, key: str) -> None:
+        with self._guard:
+            if self._syncing is None:
+                self._syncing = ThreadPoolExecutor(1, thread_name_prefix="fleetmap-sync")
+        with contextlib.suppress(RuntimeError):  # the process ends
+            self._syncing.submit(self._sync, key)
+
+    def _sync(self, key: str) -> None:
+        """Have an entry written to the disk itself; one that cannot be is removed."""
+        folder = self._path(key)
+        try:
+            for path in (*folder.iterdir(), folder, folder.parent):
+                sync(path)
+        except FileNotFoundError:
+            return  # the cache needed the room
+        except OSError as error:
+            self.discard(key, f"it could not be written: {error}")
+
+    def _keep_spare(self, key: str, product: Product) -> Made:
+        """The map in memory."""
+
+        def described(name: str, content: bytes | MadeFile, media_type: str) -> MadeFile:
+            data = content.read() if isinstance(content, MadeFile) else content
+            digest = hashlib.sha256(data).hexdigest()
+            return MadeFile(name, len(data), digest, media_type, None, product.places.get(name), data)
+
+        files = tuple(described(name, *content) for name, content in product.files.items())
+        archive = described(*product.archive, "application/zip") if product.archive else None
+        made = Made(files, archive, product.report)
+        with self._guard:
+            self._spare[key] = made
+            while len(self._spare) > 1 and sum(m.size for m in self._spare.values()) > SPARE_BYTES:
+                self._spare.popitem(last=False)
+        return made
+
+    def _note_problem(self, error: OSError | None) -> None:
+        """Log that the disk refuses, or works again: once each."""
+        reason = None if error is None else str(error.strerror or error)
+        if (reason is None) != (self.problem is None):
+            if reason is None:
+                log.warning("cache: maps are kept on disk again")
+            else:
+                log.error("cache: the disk refuses, maps are made and kept in memory (reason=%s)", reason)
+        self.problem = reason
+        if reason is None:
+            with self._guard:
+                self._spare.clear()
 
     def by_hash(self, sha256: str, most: int) -> bytes | None:
         """The content of a made file that is still here, by its SHA-256; None where it is gone or larger."""
@@ -176,6 +425,8 @@ class Cache:
 
     def _note_hash(self, file: MadeFile) -> None:
         path = self._hash_path(file.sha256)
+        if file.path is None:
+            return
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             temporary = path.with_suffix(f".{uuid4().hex}")
@@ -194,14 +445,14 @@ class Cache:
                 break
             for line in self._described_hashes(folder):
                 self._hash_path(line).unlink(missing_ok=True)
-            shutil.rmtree(folder, ignore_errors=True)
+            self._remove(folder)
             total -= size
         self._total = total
 
     def _described_hashes(self, folder: Path) -> list[str]:
         """The hashes that lead to this folder."""
         try:
-            described = orjson.loads((folder / "map.json").read_bytes())
+            described = orjson.loads((folder / "map.json").read_bytes().partition(b"\n")[2])
             every = [*described["files"], *([described["archive"]] if described["archive"] else [])]
             place = folder.relative_to(self._folder).as_posix() + "/"
             return [f["sha256"] for f in every if self._hash_path(f["sha256"]).read_text().startswith(place)]
@@ -223,8 +474,11 @@ class Cache:
             lock = self._locks.setdefault(key, threading.Lock())
         with lock:
             path = self._folder / "locks" / key[:2]  # few files; neighbours in the hash wait for each other, rarely
-            with path.open("w") as handle:
-                fcntl.flock(handle, fcntl.LOCK_EX)
+            with contextlib.ExitStack() as stack:
+                try:
+                    fcntl.flock(stack.enter_context(path.open("w")), fcntl.LOCK_EX)
+                except OSError as error:  # without room for a lock two processes may make the same map
+                    self._note_problem(error)
                 yield
         with self._guard:
             if not lock.locked():
@@ -234,16 +488,19 @@ class Cache:
         return self._folder / key[:2] / key
 
 
-def _write(folder: Path, stored: str, name: str, data: bytes | Path, media_type: str) -> dict[str, Any]:
+def _write(folder: Path, stored: str, name: str, data: bytes | MadeFile, media_type: str) -> dict[str, Any]:
     target = folder / stored
-    if isinstance(data, Path):
-        _link(data, target)
-        with target.open("rb") as stream:
-            digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    if isinstance(data, MadeFile) and data.path is not None:
+        try:
+            _link(data.path, target)
+        except FileNotFoundError as error:
+            raise data.lost(error) from error
+        digest, size = _hash(target), target.stat().st_size
+        data.check(digest)
     else:
-        target.write_bytes(data)
-        digest = hashlib.sha256(data).hexdigest()
-    size = target.stat().st_size
+        content = data.read() if isinstance(data, MadeFile) else data
+        target.write_bytes(content)
+        digest, size = hashlib.sha256(content).hexdigest(), len(content)
     return {"name": name, "stored": stored, "size": size, "sha256": digest, "media_type": media_type}
 
 
@@ -257,7 +514,44 @@ def _link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def _described(folder: Path, f: dict[str, Any]) -> MadeFile:
+def _written(file: MadeFile) -> int:
+    try:
+        return 0 if file.path is None else file.path.stat().st_mtime_ns
+    except OSError:
+        return -1
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _check_files(made: Made) -> None:
+    """LostMap unless all files of an entry match their hashes; what is wrong is reported as damage."""
+    for file in made.every():
+        assert file.path is not None
+        try:
+            digest = _hash(file.path)
+        except FileNotFoundError as error:
+            if (file.path.parent / "map.json").exists():  # else the whole entry was removed meanwhile
+                file.on_damage(f"{file.name!r} is missing")
+            raise file.lost(error) from error
+        except OSError as error:
+            raise file.lost(error) from error
+        file.check(digest)
+
+
+def sync(path: Path) -> None:
+    """Have a file or folder written to the disk itself."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _described(folder: Path, f: dict[str, Any], on_damage: Callable[[str], None]) -> MadeFile:
     level, name = f.get("place") or (None, None)
     place = None if level is None or name is None else (level, name)
-    return MadeFile(f["name"], f["size"], f["sha256"], f["media_type"], folder / f["stored"], place)
+    path = folder / f["stored"]
+    return MadeFile(f["name"], f["size"], f["sha256"], f["media_type"], path, place, on_damage=on_damage)

@@ -8,6 +8,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from app.convert import files as direct
 from app.convert import make as making
 from app.convert import recipe as recipes
 from app.convert import site
-from app.convert.cache import Cache, Made, MadeFile, Product
+from app.convert.cache import Cache, LostMap, Made, MadeFile, Product
 from app.convert.recipe import Hindrance, Recipe
 from app.errors import (
     Ambiguous,
@@ -168,13 +169,16 @@ class Maps:
 
     def _put_together(self, recipe: Recipe, stop: Stop | None) -> Made:
         """A map of several: each is made by itself. Those that are there already stay while the others are made."""
-        with self.cache.holding() as hold:
-            held = [self._held(member.recipe, hold, stop) for member in recipe.members]
-            return self.cache.get_or_make(recipe.key, lambda: joined(recipe, held))
+        for _ in range(HOLD_ATTEMPTS):
+            # A member whose file turns out to be damaged leaves the cache, and is made again.
+            with contextlib.suppress(LostMap), self.cache.holding() as hold:
+                held = [self._held(member.recipe, hold, stop) for member in recipe.members]
+                return self.cache.get_or_make(recipe.key, partial(joined, recipe, held))
+        raise Unavailable("the cache of maps is damaged again and again: its disk may be failing")
 
     def _held(self, recipe: Recipe, hold: Callable[[Made], Made], stop: Stop | None) -> Made:
         for _ in range(HOLD_ATTEMPTS):
-            with contextlib.suppress(FileNotFoundError):  # the cache needed the room in this very moment
+            with contextlib.suppress(LostMap):  # the cache needed the room in this very moment
                 return hold(self.make(recipe, stop))
         raise Unavailable("the cache of maps is too small for what is made at once: try again, or enlarge it")
 
@@ -422,7 +426,7 @@ class Maps:
             )
         except WorkerDied as error:
             raise CannotConvert(f"{recipe.format.name} could not be made: {error.detail}") from error
-        typed: dict[str, tuple[bytes | Path, str]] = {
+        typed: dict[str, tuple[bytes | MadeFile, str]] = {
             name: (data, making.media_type(recipe.format, name)) for name, data in written.files.items()
         }
         archive = None
@@ -449,7 +453,7 @@ def file_of(recipe: Recipe, made: Made, file: str | None) -> MadeFile:
 
 def joined(recipe: Recipe, held: Sequence[Made]) -> Product:
     """The files of all members, each at its place; of two of one name the first stays, and the report says so."""
-    files: dict[str, tuple[bytes | Path, str]] = {}
+    files: dict[str, tuple[bytes | MadeFile, str]] = {}
     places: dict[str, tuple[str, str]] = {}
     clashes: list[dict[str, Any]] = []
     for member, made in zip(recipe.members, held, strict=True):
@@ -460,7 +464,7 @@ def joined(recipe: Recipe, held: Sequence[Made]) -> Product:
                 why = f"a file of {places[name][1]!r} has the same name: rename one of the two"
                 clashes.append({"what": f"file {name} of {place[1] if place else name!r}", "count": 1, "why": why})
                 continue
-            files[name] = (file.path, file.media_type)
+            files[name] = (file, file.media_type)
             if place is not None:
                 places[name] = place
     if not files:
@@ -475,18 +479,18 @@ def joined(recipe: Recipe, held: Sequence[Made]) -> Product:
 class _Contents(Mapping[str, bytes]):
     """Files by name, read when they are needed."""
 
-    def __init__(self, paths: Mapping[str, bytes | Path]) -> None:
-        self._paths = paths
+    def __init__(self, files: Mapping[str, bytes | MadeFile]) -> None:
+        self._files = files
 
     def __getitem__(self, name: str) -> bytes:
-        found = self._paths[name]
-        return found if isinstance(found, bytes) else found.read_bytes()
+        found = self._files[name]
+        return found if isinstance(found, bytes) else found.read()
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._paths)
+        return iter(self._files)
 
     def __len__(self) -> int:
-        return len(self._paths)
+        return len(self._files)
 
 
 def _with_origin(recipe: Recipe, origin: Mapping[str, str]) -> Recipe:

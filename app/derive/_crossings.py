@@ -9,12 +9,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from app.derive._obstacles import body_of
 from app.errors import FleetMapError, Invalid, MissingDatum, Problem
 from app.model import masks
 from app.model.features import Features, Properties
 from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import MAP, Layers, PartKey
+from app.model.obstacles import footprint_of
 from app.model.solids import Solids
 
 Array = NDArray[np.float64]
@@ -136,7 +136,7 @@ def _bodies(around: Layers, level: str) -> list[Any]:
             continue
         for p, geometry in zip(chosen.properties, shapes, strict=True):
             try:
-                body = body_of({**p, "shapes": None}, geometry, solids)
+                body = footprint_of({**p, "shapes": None}, geometry, solids)
             except FleetMapError:  # what it is made of cannot be used: its derivations report it
                 continue
             if body is not None and not body.is_empty:

@@ -156,7 +156,7 @@ def _touched(edges: Array, owner: NDArray[np.int64], layer: NDArray[np.int64], f
         run = y1 - y0
         with np.errstate(all="ignore"):
             at0, at1 = (row - y0) / run, (row + 1 - y0) / run
-        flat = run == 0
+        flat = np.abs(run) <= end  # else rounding decides which part of a level edge is in the row
         t0 = np.where(flat, 0.0, np.clip(np.minimum(at0, at1), 0.0, 1.0))
         t1 = np.where(flat, 1.0, np.clip(np.maximum(at0, at1), 0.0, 1.0))
         left, right = x0 + (x1 - x0) * t0, x0 + (x1 - x0) * t1

@@ -880,5 +880,7 @@ register(
         extensions=(".site.json", ".site.ron", ".json", ".ron"),
         choose=choose,
         by_file=by_file,
+        titled=True,
+        bends="nodes",
     )
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from app import bundle, formats
 from app.bundle import Bundle, Hints, Known
-from app.errors import Invalid, Problem
+from app.errors import Damaged, Invalid, Problem
 from app.formats import Limits
 from app.ingest.match import OWN_IDS, match_ids
 from app.model.features import Features, merge_documents
@@ -69,11 +70,11 @@ def prepare_upload(
     store = open_store(database_url, blob_dir)
     uploaded = {name: path.read_bytes() for name, path in paths.items()}
     files = bundle.unpack(uploaded, limits)
-    told = bundle.read(files, hints, Known(base.datum, _fence(store, base)), limits)
+    told = bundle.read(files, hints, Known(base.datum, fence_of(store, base)), limits)
     renamed: dict[str, dict[str, str]] = {}
     # Sorted, so objects come before the topology that was drawn from them.
     operations: list[Operation] = [
-        _operation(store, base, told, key, mode, files, renamed) for key in sorted(told.parts)
+        operation_for(store, base, told, key, mode, files, renamed) for key in sorted(told.parts)
     ]
     operations += _stale_clouds(base, told)
     warnings = [*told.warnings, *_idle(hints, told)]
@@ -172,16 +173,18 @@ def moved(base: Version, datum: Datum) -> list[Problem]:
     ]
 
 
-def _fence(store: Store, base: Version) -> shapely.Polygon | None:
+def fence_of(store: Store, base: Version) -> shapely.Polygon | None:
+    """The fence of a version's location."""
     keys = [e.key for e in base.parts if e.key.layer == "location" and e.count]
-    for part in store.load(base, keys).parts.values() if keys else ():
-        if isinstance(part, Features) and len(part):
-            polygon: shapely.Polygon = part.geometry[0]
-            return polygon
+    with contextlib.suppress(Damaged):  # the upload may be the one that heals it
+        for part in store.load(base, keys).parts.values() if keys else ():
+            if isinstance(part, Features) and len(part):
+                polygon: shapely.Polygon = part.geometry[0]
+                return polygon
     return None
 
 
-def _operation(
+def operation_for(
     store: Store,
     base: Version,
     told: Bundle,
@@ -203,7 +206,9 @@ def _operation(
         if key.layer == "topology" and key.level in renamed:
             part = _drawn_from(part, renamed[key.level])
         if held and key.layer in ("topology", "objects", "zones") and origin not in OWN_IDS:
-            ids, part = part.ids, match_ids(store, base, key, part)
+            ids = part.ids
+            with contextlib.suppress(Damaged):  # then nothing is there to compare with, and the upload's ids stay
+                part = match_ids(store, base, key, part)
             if key.layer == "objects":
                 renamed.setdefault(key.level, {}).update((a, b) for a, b in zip(ids, part.ids, strict=True) if a != b)
         if mode == "merge":

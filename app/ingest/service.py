@@ -387,13 +387,12 @@ class Ingest:
     ) -> Outcome:
         if not prepared.changed:
             # The key is remembered too: sent again after others have changed the map, this must not undo their work.
-            if key is not None:
-                noted = Idempotency(key.key, UNCHANGED + key.fingerprint)
+            noted = None if key is None else Idempotency(key.key, UNCHANGED + key.fingerprint)
+            same = base
+            if noted is not None or sources or prepared.chunks:
                 same = self._store.commit(
                     environment, prepared, author=author, message=message, sources=tuple(sources), idempotency=noted
                 )
-            else:
-                same = self._store.add_sources(environment, base.number, sources) if sources else base
             return Outcome("unchanged", same, {**same.as_dict(), "warnings": [w.as_dict() for w in warnings]})
         made = self._store.commit(
             environment,

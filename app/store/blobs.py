@@ -9,6 +9,7 @@ in progress leaves it alone.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import io
@@ -26,9 +27,11 @@ from typing import BinaryIO, Final
 from sqlalchemy import Connection, bindparam, delete, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from app.errors import Damaged, Invalid, NotFound, Unavailable
-from app.store.database import Database
+from app.errors import NO_ROOM, Damaged, Invalid, NoRoom, NotFound, Unavailable
+from app.store.database import Database, check_room
 from app.store.tables import blob
+
+REPAIR: Final = "run `fleetmap verify --repair`, upload the same file again, or restore it from a backup"
 
 PACKED_BELOW: Final = 64 * 2**10
 """Smaller files of one upload share a pack."""
@@ -104,16 +107,15 @@ class Blobs:
     def put_many(self, files: Sequence[bytes | Path]) -> list[str]:
         """Store several files with one set of fsyncs; their SHA-256s in the same order.
 
-        Small ones (below 64 KiB) go into one pack. Nothing is written twice. Unavailable where the disk refuses.
+        Small ones (below 64 KiB) go into one pack. Nothing is written twice; what is stored already is hashed again,
+        and replaced where it is damaged or lost. Unavailable where the disk refuses.
         """
         if self._readonly:
             raise Invalid("this store was opened for reading only")
         try:
             return self._put_many(files)
         except OSError as error:
-            raise Unavailable(
-                f"the blob folder cannot be written: {error.strerror or error}. Try again later"
-            ) from error
+            raise _refusal(error) from error
 
     def _put_many(self, files: Sequence[bytes | Path]) -> list[str]:
         names: list[str] = []
@@ -132,7 +134,7 @@ class Blobs:
             sizes[name] = size
             names.append(name)
         known = self._touch(sizes)
-        lost = {n for n in sizes if not self._present(n, known.get(n))}
+        lost = {n for n in sizes if n not in known or self._problem(n, known[n]) is not None}
         if lost:
             with self._workspace() as workspace:
                 self._write_large(workspace, {n: d for n, d in large.items() if n in lost})
@@ -161,14 +163,24 @@ class Blobs:
                 out.update(self._rows(connection, some))
         return out
 
-    def _present(self, name: str, row: _Row | None) -> bool:
-        if row is None:
-            return False
-        path = self._path(name) if row.pack is None else self._packs / row.pack
+    def _problem(self, name: str, row: _Row) -> str | None:
+        """What is wrong with a stored file, None where it has its hash: ``lost``, ``damaged``."""
+        digest = hashlib.sha256()
         try:
-            return path.stat().st_size >= row.start + row.size
-        except OSError:
-            return False
+            with (self._path(name) if row.pack is None else self._packs / row.pack).open("rb") as file:
+                file.seek(row.start)
+                left = row.size
+                while left and (block := file.read(min(BLOCK, left))):
+                    digest.update(block)
+                    left -= len(block)
+                whole = not left and (row.pack is not None or not file.read(1))
+        except FileNotFoundError:
+            return "lost"
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            return "damaged"
+        return None if whole and digest.hexdigest() == name else "damaged"
 
     def _write_large(self, workspace: Path, files: Mapping[str, bytes | Path]) -> None:
         folders: set[Path] = set()
@@ -246,9 +258,9 @@ class Blobs:
             if data is None:  # it was moved to another pack between the query and the read
                 data = self._read(name, self._row(name))
             if data is None:
-                raise Damaged(f"the stored file {name} is lost: restore it from a backup")
+                raise Damaged(f"the stored file {name} is lost: {REPAIR}")
             if hashlib.sha256(data).hexdigest() != name:
-                raise Damaged(f"the stored file {name} does not match its hash: restore it from a backup")
+                raise Damaged(f"the stored file {name} does not match its hash: {REPAIR}")
             out[name] = data
         return out
 
@@ -272,16 +284,22 @@ class Blobs:
         try:
             file = self._path(sha256).open("rb")
         except OSError as error:
-            raise Damaged(f"the stored file {sha256} is lost: restore it from a backup") from error
+            raise Damaged(f"the stored file {sha256} is lost: {REPAIR}") from error
         if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
             file.close()
-            raise Damaged(f"the stored file {sha256} does not match its hash: restore it from a backup")
+            raise Damaged(f"the stored file {sha256} does not match its hash: {REPAIR}")
         file.seek(0)
         return file
 
     def path(self, sha256: str) -> Path | None:
         """The file with exactly this content, None where it is packed with others. Its bytes are not checked here."""
         return None if self._row(sha256).pack is not None else self._path(sha256)
+
+    def has(self, sha256: str) -> bool:
+        """Whether it is stored with the right content."""
+        with self._database.read() as connection:
+            row = self._rows(connection, [sha256]).get(sha256)
+        return row is not None and self._problem(sha256, row) is None
 
     def size(self, sha256: str) -> int:
         """Bytes of the content."""
@@ -313,9 +331,9 @@ class Blobs:
                 return
             self.prepare()
             with self._workspace() as workspace:
-                (workspace / "probe").write_bytes(b"")
+                check_room(workspace)
         except OSError as error:
-            raise Unavailable(f"the blob folder cannot be written: {error.strerror or error}") from error
+            raise _refusal(error) from error
 
     def recover(self, older_than: float) -> int:
         """Remove workspaces of processes that are gone, and packs that no row knows if older (seconds); how many."""
@@ -394,15 +412,33 @@ class Blobs:
 
     def verify(self) -> list[str]:
         """Hash everything; the names of what is damaged or lost."""
-        with self._database.read() as connection:
-            names = list(connection.execute(select(blob.c.sha256).order_by(blob.c.sha256)).scalars())
-        bad = []
-        for name in names:
-            try:
-                self.open(name).close()
-            except (Damaged, NotFound):
-                bad.append(name)
-        return bad
+        return [name for name, _, problem in self.checked() if problem is not None]
+
+    def checked(self, after: str = "") -> Iterator[tuple[str, int, str | None]]:
+        """Hash one file after the other, by their names: (name, bytes, ``lost``, ``damaged`` or None)."""
+        while True:
+            query = select(blob.c.sha256).where(blob.c.sha256 > after).order_by(blob.c.sha256).limit(BATCH)
+            with self._database.read() as connection:
+                rows = self._rows(connection, list(connection.execute(query).scalars()))
+            for name, row in sorted(rows.items()):
+                problem = self._problem(name, row)
+                if problem is not None:  # it may have moved to another pack, or gone, between the query and the read
+                    with self._database.read() as connection:
+                        moved = self._rows(connection, [name]).get(name)
+                    problem = None if moved is None else self._problem(name, moved)
+                yield name, row.size, problem
+            if len(rows) < BATCH:
+                return
+            after = max(rows)
+
+
+def _refusal(error: OSError) -> Unavailable:
+    if error.errno in NO_ROOM:
+        return NoRoom(
+            f"the server has no room left for files ({error.strerror}); nothing was stored. Try again once its "
+            "operator has made room"
+        )
+    return Unavailable(f"the blob folder cannot be written: {error.strerror or error}. Try again later")
 
 
 def _upsert(connection: Connection, rows: Sequence[Mapping[str, object]]) -> None:

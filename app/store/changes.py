@@ -100,11 +100,11 @@ class IndexRows:
 class Prepared:
     """A version ready to be committed on top of version ``base``; plain data, so it can cross processes.
 
-    chunks: hash (hex) -> stored bytes of all chunks that the base does not have. blobs: SHA-256 -> content of files
-    that belong to the content (resources). changes: counts by layer. changed: whether the root differs from the
-    base's, or what says where the content comes from is renewed. index: the index' changes where they are few, else
-    None (it is brought up to date when it is asked). area: KEEP if it is the base's, None if the next query computes
-    it.
+    chunks: hash (hex) -> stored bytes of all chunks that the base does not have, or has damaged. blobs: SHA-256 ->
+    content of files that belong to the content (resources). changes: counts by layer. changed: whether the root differs
+    from the base's, or what says where the content comes from is renewed. index: the index' changes where they are few,
+    else None (it is brought up to date when it is asked). area: KEEP if it is the base's, None if the next query
+    computes it.
     """
 
     base: int

@@ -5,15 +5,17 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from sqlalchemy import Connection
+from sqlalchemy import Connection, select
 
 from app.errors import Damaged
+from app.store import tables
 from app.store.database import Database
 from app.store.encode import decompress, digest
 
 BATCH = 500
+REPAIR = "run `fleetmap verify --repair`, or restore a backup"
 CACHE_BYTES = 64 * 2**20
 BIGGEST_CACHED = 2**20
 
@@ -44,28 +46,54 @@ class Chunks:
             self._keep(read)
         return out
 
+    def damaged(self, hashes: Sequence[bytes]) -> dict[bytes, str]:
+        """Those that the database has not whole, whatever is in memory: hash -> ``lost`` or ``damaged``."""
+        out = dict.fromkeys(hashes, "lost")
+        for start in range(0, len(hashes), BATCH):
+            for name, data in self._rows(hashes[start : start + BATCH]):
+                if problem(name, data) is None:
+                    out.pop(name, None)
+                else:
+                    out[name] = "damaged"
+        return out
+
+    def checked(self, after: bytes = b"") -> Iterator[tuple[bytes, int, str | None]]:
+        """Hash one stored chunk after the other, by their hashes: (hash, bytes, ``damaged`` or None)."""
+        table = tables.chunk
+        while True:
+            query = select(table.c.hash, table.c.data).where(table.c.hash > after).order_by(table.c.hash).limit(BATCH)
+            with self._database.read() as connection:
+                rows = connection.execute(query).all()
+            for row in rows:
+                yield bytes(row.hash), len(row.data), problem(bytes(row.hash), bytes(row.data))
+            if len(rows) < BATCH:
+                return
+            after = bytes(rows[-1].hash)
+
+    def _rows(self, hashes: Sequence[bytes]) -> list[tuple[bytes, bytes]]:
+        with self._database.read() as connection:
+            if self._database.sqlite:
+                marks = ",".join("?" * len(hashes))
+                rows = connection.exec_driver_sql(
+                    f"SELECT hash, data FROM chunk WHERE hash IN ({marks})",  # noqa: S608 - only question marks
+                    tuple(hashes),
+                )
+            else:
+                rows = connection.exec_driver_sql("SELECT hash, data FROM chunk WHERE hash = ANY(%s)", (list(hashes),))
+            return [(bytes(name), bytes(data)) for name, data in rows.fetchall()]
+
     def _query(self, hashes: Sequence[bytes]) -> dict[bytes, bytes]:
         out: dict[bytes, bytes] = {}
-        with self._database.read() as connection:
-            for start in range(0, len(hashes), BATCH):
-                some = list(hashes[start : start + BATCH])
-                if self._database.sqlite:
-                    marks = ",".join("?" * len(some))
-                    rows = connection.exec_driver_sql(
-                        f"SELECT hash, data FROM chunk WHERE hash IN ({marks})",  # noqa: S608 - only question marks
-                        tuple(some),
-                    )
-                else:
-                    rows = connection.exec_driver_sql("SELECT hash, data FROM chunk WHERE hash = ANY(%s)", (some,))
-                for name, data in rows.fetchall():
-                    raw = decompress(bytes(data))
-                    if digest(raw) != bytes(name):
-                        raise Damaged(f"the stored chunk {bytes(name).hex()} does not match its hash: restore a backup")
-                    out[bytes(name)] = raw
+        for start in range(0, len(hashes), BATCH):
+            for name, data in self._rows(hashes[start : start + BATCH]):
+                raw = decompress(data)
+                if digest(raw) != name:
+                    raise Damaged(f"the stored chunk {name.hex()} does not match its hash: {REPAIR}")
+                out[name] = raw
         self.reads += len(out)
         for h in hashes:
             if h not in out:
-                raise Damaged(f"the stored chunk {h.hex()} is missing: restore a backup")
+                raise Damaged(f"the stored chunk {h.hex()} is missing: {REPAIR}")
         return out
 
     def _keep(self, read: Mapping[bytes, bytes]) -> None:
@@ -86,8 +114,18 @@ class Chunks:
             self._bytes = 0
 
 
+def problem(name: bytes, data: bytes) -> str | None:
+    """``damaged`` where stored bytes do not have the chunk's hash, else None."""
+    try:
+        return None if digest(decompress(data)) == name else "damaged"
+    except Damaged:
+        return "damaged"
+
+
 def insert(connection: Connection, chunks: Mapping[str, bytes], now: float | None = None) -> None:
     """Write chunks (hash in hex -> stored bytes); one that is there counts as used now.
+
+    It gets these bytes too, which heals it where it was damaged.
 
     Sorted by hash, so that two uploads with common chunks wait for each other instead of deadlocking.
     """
@@ -98,7 +136,7 @@ def insert(connection: Connection, chunks: Mapping[str, bytes], now: float | Non
     mark = "?" if connection.dialect.name == "sqlite" else "%s"
     connection.exec_driver_sql(
         f"INSERT INTO chunk (hash, data, used) VALUES ({mark}, {mark}, {mark}) "  # noqa: S608 - only marks
-        "ON CONFLICT (hash) DO UPDATE SET used = excluded.used",
+        "ON CONFLICT (hash) DO UPDATE SET used = excluded.used, data = excluded.data",
         rows,
     )
 

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import secrets
+import shutil
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,13 +18,34 @@ import orjson
 from sqlalchemy import Connection, Engine, create_engine, event, exc
 from sqlalchemy.engine import make_url
 
-from app.errors import Invalid, Unavailable
+from app.errors import NO_ROOM, DatabaseDamaged, FleetMapError, Invalid, NoRoom, Unavailable
+
+log = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from app.store.audit import Caller
 
 BUSY_MILLISECONDS = 5000
 TURN_SECONDS = 30.0
+RECHECK_SECONDS = 60.0
+"""How often a database that was found damaged is checked again."""
+
+ROOM_BYTES = 2**20
+"""Free space below which a folder is not writable, and an I/O error of SQLite means a full disk."""
+
+REPAIR = "stop the server, run `fleetmap verify`, and restore a backup of the database"
+_CORRUPT = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
+_CORRUPT_STATES = frozenset({"XX001", "XX002", "58P01"})
+"""PostgreSQL: data_corrupted, index_corrupted, undefined_file."""
+
+_DISK_FULL_STATE = "53100"
+
+
+def _from_json(text: str | bytes) -> Any:
+    try:
+        return orjson.loads(text)
+    except orjson.JSONDecodeError as error:
+        raise DatabaseDamaged(f"a value in the database is not JSON any more: {REPAIR}") from error
 
 
 def engine(url: str, *, readonly: bool) -> Engine:
@@ -32,7 +58,7 @@ def engine(url: str, *, readonly: bool) -> Engine:
         ) from error
     options: dict[str, Any] = {
         "json_serializer": lambda value: orjson.dumps(value).decode(),
-        "json_deserializer": orjson.loads,
+        "json_deserializer": _from_json,
         "pool_size": 8,
         "max_overflow": 24,
         "pool_timeout": 30,
@@ -78,11 +104,15 @@ def _sqlite_begin(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
 
 
+class _FileGone(DatabaseDamaged):
+    """SQLite's file is not the one that was opened. It may come back at any moment."""
+
+
 class Database:
     """Transactions on an engine. Every database error that another try may not have becomes Unavailable.
 
     written: called after each commit, so that caches in memory can tell. record: adds who makes the change to its
-    transaction.
+    transaction. file: SQLite's; None on PostgreSQL.
     """
 
     def __init__(
@@ -96,19 +126,28 @@ class Database:
         self.engine = engine(url, readonly=readonly)
         self._written, self._record = written, record
         self.sqlite = self.engine.dialect.name == "sqlite"
+        name = self.engine.url.database if self.sqlite else None
+        self.file = Path(name) if name and name != ":memory:" and not name.startswith("file:") else None
+        self._inode: int | None = None
+        self._damage: tuple[float, str] | None = None
+        self._gone = ""
+        self._readonly = readonly
         # SQLite lets whoever happens to look at the right moment write: among many, one may never come to it.
         self._turn = threading.Lock()
+        if self.file is not None:
+            event.listen(self.engine, "do_connect", self._before_connect)
+            event.listen(self.engine, "connect", self._after_connect)
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """A transaction that only reads."""
-        with translated(), self.engine.connect() as connection:
+        with self.connected() as connection:
             yield connection
 
     @contextmanager
     def snapshot(self) -> Iterator[Connection]:
         """A transaction that only reads, all of it from one state."""
-        with translated(), self.engine.connect() as connection:
+        with self.connected() as connection:
             if not self.sqlite:
                 connection.execution_options(isolation_level="REPEATABLE READ")
             yield connection
@@ -116,7 +155,7 @@ class Database:
     @contextmanager
     def write(self, *, tell: bool = True) -> Iterator[Connection]:
         """A transaction that writes: all or nothing, and on disk when it ends. tell: whether caches are to know."""
-        with self._in_turn(), translated(), self.engine.connect() as connection:
+        with self._in_turn(), self.connected() as connection:
             connection.execution_options(write=True)
             with connection.begin():
                 yield connection
@@ -125,6 +164,145 @@ class Database:
             caller.recorded = True
         if tell:
             self._written()
+
+    @contextmanager
+    def connected(self) -> Iterator[Connection]:
+        """A connection whose errors are ours: Unavailable, NoRoom, DatabaseDamaged; Invalid for a NUL that somebody
+        requests, which PostgreSQL has no text with.
+        """
+        try:
+            self._check_file()
+            with self.engine.connect() as connection:
+                yield connection
+        except exc.DataError as error:
+            if "NUL" not in _short(error):
+                raise
+            raise Invalid("a name or text has a NUL character: nothing here has one") from error
+        except (exc.DBAPIError, exc.TimeoutError) as error:
+            ours = self._error(error)
+            if ours is None:
+                raise
+            raise ours from error
+        except _FileGone:
+            raise
+        except DatabaseDamaged as error:
+            self.note_damage(error.detail)
+            raise
+
+    def check(self) -> None:
+        """DatabaseDamaged where damage was found and is still there; a damaged SQLite file is checked now and then."""
+        self._check_file()
+        if self._damage is None:
+            return
+        since, detail = self._damage
+        if time.monotonic() - since > RECHECK_SECONDS:
+            problem = self.integrity(1) if self.sqlite else None
+            if problem is None:
+                self._damage = None
+                log.warning("database: no damage is found any more")
+                return
+            self._damage = time.monotonic(), detail
+        raise DatabaseDamaged(detail)
+
+    def check_room(self) -> None:
+        """NoRoom or Unavailable unless the folder of SQLite's file can be written."""
+        if self.file is None:
+            return
+        try:
+            check_room(self.file.parent)
+        except OSError as error:
+            kind = NoRoom if error.errno in NO_ROOM else Unavailable
+            raise kind(f"the folder of the database cannot be written: {error.strerror}") from error
+
+    def integrity(self, limit: int, *, quick: bool = True) -> str | None:
+        """What SQLite's own check of its pages finds wrong, up to ``limit`` lines; None for nothing, or PostgreSQL."""
+        if not self.sqlite:
+            return None
+        try:
+            with self.connected() as connection:
+                check = "quick_check" if quick else "integrity_check"
+                lines = list(connection.exec_driver_sql(f"PRAGMA {check}({limit})").scalars())
+        except DatabaseDamaged as error:
+            return error.detail
+        return None if lines == ["ok"] else "; ".join(map(str, lines))
+
+    def note_damage(self, detail: str) -> None:
+        """Report damage that was found: from now on ``check`` fails."""
+        first = self._damage is None
+        self._damage = time.monotonic(), detail
+        if first:  # once, not for each request
+            log.critical("database: %s (database=%s)", detail, self.file or self._name)
+
+    def report_damage(self, problem: str) -> None:
+        """The same, of what a check of the pages found."""
+        self.note_damage(f"the database {self._name} is damaged ({problem[:200]}): {REPAIR}")
+
+    @property
+    def _name(self) -> str:
+        """What clients may read: no path, no password."""
+        return f"file {self.file.name}" if self.file is not None else str(self.engine.url.database)
+
+    def _check_file(self) -> None:
+        """DatabaseDamaged where SQLite's file is no longer the one that was opened: writes to it would be lost."""
+        if self.file is None or self._inode is None:
+            return
+        try:
+            inode = self.file.stat().st_ino
+        except OSError as error:
+            what = "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
+            problem = f"the database {self._name} {what}: stop the server, put the file back or restore a backup"
+        else:
+            problem = f"the database {self._name} was replaced while the server runs: restart the server"
+            problem = "" if inode == self._inode else problem
+        if problem and problem != self._gone:  # once, not for each request
+            log.critical("database: %s (database=%s)", problem, self.file)
+        self._gone = problem
+        if problem:
+            raise _FileGone(problem)
+
+    def _before_connect(self, *_: object) -> None:
+        """SQLite would make an empty file where there is none any more."""
+        self._check_file()
+        if self._readonly and self.file is not None and not self.file.exists():
+            raise _FileGone(f"the database {self._name} is missing: restore a backup")
+
+    def _after_connect(self, *_: object) -> None:
+        if self._inode is None and self.file is not None:
+            self._inode = self.file.stat().st_ino
+
+    def _error(self, error: exc.SQLAlchemyError) -> FleetMapError | None:
+        """A database error as ours; None where it is none of the database's making."""
+        original = getattr(error, "orig", None)
+        code = getattr(original, "sqlite_errorcode", 0) & 0xFF
+        state = getattr(original, "sqlstate", None)
+        if code in _CORRUPT or state in _CORRUPT_STATES or "Could not decode to UTF-8" in str(original):
+            self.report_damage(_short(error))
+            return DatabaseDamaged(self._damage[1] if self._damage else "")
+        full = code == sqlite3.SQLITE_FULL or state == _DISK_FULL_STATE
+        if full or (code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and self._is_full()):
+            return NoRoom(
+                f"the server has no room left for its database ({_short(error)}); nothing was stored. Try again once "
+                "its operator has made room"
+            )
+        if code == sqlite3.SQLITE_READONLY:
+            return Unavailable(
+                f"the database {self._name} cannot be written ({_short(error)}); nothing was stored. Its operator has "
+                "to make the file and its folder writable"
+            )
+        if code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN):
+            return Unavailable(
+                f"the database {self._name} cannot be read or written ({_short(error)}): its operator has to check the "
+                "file, its folder and its disk"
+            )
+        if isinstance(error, exc.OperationalError | exc.InterfaceError | exc.TimeoutError | exc.InternalError):
+            return Unavailable(f"the database does not answer as it should: {_short(error)}. Try again later")
+        return None
+
+    def _is_full(self) -> bool:
+        try:
+            return self.file is not None and shutil.disk_usage(self.file.parent).free < ROOM_BYTES
+        except OSError:
+            return False
 
     @contextmanager
     def _in_turn(self) -> Iterator[None]:
@@ -144,20 +322,17 @@ class Database:
         self.engine.dispose()
 
 
-@contextmanager
-def translated() -> Iterator[None]:
-    """Database errors -> Unavailable; Invalid for a NUL that somebody asks for, which PostgreSQL has no text with."""
-    try:
-        yield
-    except exc.DataError as error:
-        if "NUL" not in _short(error):
-            raise
-        raise Invalid("a name or text has a NUL character: nothing here has one") from error
-    except (exc.OperationalError, exc.InterfaceError, exc.TimeoutError, exc.InternalError) as error:
-        raise Unavailable(f"the database does not answer as it should: {_short(error)}. Try again later") from error
-
-
 def _short(error: exc.SQLAlchemyError) -> str:
     """The driver's first line, without the statement and without what might be a secret in a URL."""
     original = getattr(error, "orig", None)
     return (str(original or error).splitlines() or ["no reason told"])[0][:200]
+
+
+def check_room(folder: Path) -> None:
+    """OSError unless a file of 1 MiB can be written to a folder."""
+    probe = folder / f".room-{secrets.token_hex(8)}"
+    try:
+        with probe.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, ROOM_BYTES)
+    finally:
+        probe.unlink(missing_ok=True)

@@ -48,11 +48,17 @@ class Generation:
     def _open(self) -> mmap.mmap | None:
         with self._lock:
             if self._map is None and self._folder.is_dir():
-                descriptor = os.open(self._folder / NAME, os.O_RDWR | os.O_CREAT, 0o600)
+                try:
+                    descriptor = os.open(self._folder / NAME, os.O_RDWR | os.O_CREAT, 0o600)
+                except OSError:  # a disk that is read-only: nobody on this host commits
+                    return None
                 try:
                     if os.fstat(descriptor).st_size < _NUMBER.size:
-                        os.ftruncate(descriptor, _NUMBER.size)
+                        # Real bytes, not a hole: a disk without room for them would kill whoever touches the mapping.
+                        os.pwrite(descriptor, bytes(_NUMBER.size), 0)
                     self._map = mmap.mmap(descriptor, _NUMBER.size)
+                except OSError:
+                    return None
                 finally:
                     os.close(descriptor)
             return self._map

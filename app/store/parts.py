@@ -208,13 +208,14 @@ def put_document(draft: Draft, document: Mapping[str, Any]) -> list[list[Any]]:
     return out
 
 
-def _document_chunks(root: PartRoot) -> list[bytes]:
+def document_chunks(root: PartRoot) -> list[bytes]:
+    """The chunks of a document's large members."""
     return [value for _, inline, value in root.header.get("document", ()) if inline]
 
 
 def read_document(draft: Draft, root: PartRoot) -> dict[str, Any]:
     """A collection's document."""
-    raws = draft.read_many(_document_chunks(root))
+    raws = draft.read_many(document_chunks(root))
     return {
         key: _members(raws[value], "document")[0] if chunk else value
         for key, chunk, value in root.header.get("document", ())
@@ -767,7 +768,7 @@ def load(draft: Draft, wanted: Mapping[Any, bytes], fetch: FetchBlobs) -> dict[A
 def _load_collections(draft: Draft, roots: Mapping[Any, PartRoot]) -> Iterator[tuple[Any, Features]]:
     trees = [(key, name, r.trees[name]) for key, r in roots.items() for name in ("local", "wgs84")]
     present = [(key, name, node) for key, name, node in trees if node is not None]
-    documents = [name for r in roots.values() for name in _document_chunks(r)]
+    documents = [name for r in roots.values() for name in document_chunks(r)]
     all_leaves = tree.leaves(draft, [node for _, _, node in present])
     todo = [(key, name, leaf) for (key, name, _), leaves in zip(present, all_leaves, strict=True) for leaf in leaves]
     columns_of = {key: _Columns() for key in roots}
@@ -939,7 +940,7 @@ def _load_resources(draft: Draft, root: PartRoot, fetch: FetchBlobs) -> Resource
 def all_chunks(draft: Draft, name: bytes, known: Container[bytes]) -> tuple[set[bytes], set[str]]:
     """Everything a part refers to, but what is below known nodes: hashes of its chunks, and of its blobs (hex)."""
     root = read_root(draft, name)
-    out = {name, *_document_chunks(root)}
+    out = {name, *document_chunks(root)}
     blobs: set[str] = set()
     for node in root.trees.values():
         out |= tree.names(draft, node, known)
@@ -953,7 +954,7 @@ def all_chunks(draft: Draft, name: bytes, known: Container[bytes]) -> tuple[set[
 def new_chunks(draft: Draft, name: bytes, known: Container[bytes]) -> tuple[list[bytes], list[bytes]]:
     """The draft's own chunks that a part needs: (nodes and documents, tiles). known: chunks that the base has."""
     root = read_root(draft, name)
-    nodes = [h for h in (name, *_document_chunks(root)) if h in draft.new and not draft.was_read(h)]
+    nodes = [h for h in (name, *document_chunks(root)) if h in draft.new and not draft.was_read(h)]
     tiles: list[bytes] = []
     todo = [node for node in root.trees.values() if node is not None]
     raster = root.type in ("grid", "picture")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -28,18 +28,26 @@ MAX_INDEX_ROWS: Final = 2000
 """Up to so many changed features the head's index is brought up to date with the commit, beyond when it is asked."""
 
 
-def prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
-    """A version on top of a base."""
+IsIntact = Callable[[str], bool]
+"""Whether all stored chunks of a part (its hash) still have their hashes."""
+
+
+def prepare(draft: Draft, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:
+    """A version on top of a base. What is damaged of a part that is replaced is stored again."""
     with parts.no_garbage_collection():
-        return _prepare(draft, base, changes)
+        return _prepare(draft, base, changes, is_intact)
 
 
-def _prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
+def _prepare(draft: Draft, base: Version, changes: Changes, is_intact: IsIntact) -> Prepared:
     entries = {entry.key: entry for entry in base.parts}
+    before = dict(entries)
     blobs: dict[str, bytes] = {}
     replaced: dict[PartKey, Replace] = {}
     for operation in changes.operations:
-        made = _apply(draft, entries, operation)
+        key = operation.key
+        if isinstance(operation, Replace) and key in before and not is_intact(before[key].hash):
+            del before[key], entries[key]  # it cannot be compared with, and none of its chunks counts as stored
+        made = compose_operation(draft, entries, operation)
         if made is not None:
             blobs.update(made.blobs)
         if isinstance(operation, Replace):
@@ -51,18 +59,19 @@ def _prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
     templates = base.templates if changes.templates is KEEP else changes.templates
     listed = tuple(entries[key] for key in sorted(entries))
     root = version_root(listed, datum, levels, templates)
-    before = {entry.key: entry for entry in base.parts}
+    damaged = {entry.key for entry in base.parts} - before.keys()
+    fresh = _fresh(draft, before, entries)
     renewed = _renewed(before, entries, replaced)
     if root == base.root and not renewed:
-        return Prepared(base.number, root, {}, base.parts, datum, levels, templates, {}, changed=False, area=KEEP)
+        same = Prepared(base.number, root, fresh, base.parts, datum, levels, templates, {}, changed=False, area=KEEP)
+        return replace(same, blobs=blobs)
     what, features = summarise(draft, before, entries, replaced)
     what |= frame_changes(base.datum, datum, base.levels, levels)
     what |= template_changes(base.templates, templates)
     what |= {"renewed": renewed} if renewed else {}
     index = None
-    if datum == base.datum:
+    if datum == base.datum and not damaged:
         index = index_rows(features, datum)
-    fresh = _fresh(draft, before, entries)
     return Prepared(
         base.number,
         root,
@@ -75,7 +84,7 @@ def _prepare(draft: Draft, base: Version, changes: Changes) -> Prepared:
         changed=True,
         blobs=blobs,
         index=index,
-        area=area_after(draft, base.parts, listed, base.datum, datum),
+        area=None if damaged else area_after(draft, base.parts, listed, base.datum, datum),
     )
 
 
@@ -113,7 +122,8 @@ def _check_levels(levels: Sequence[Level]) -> tuple[Level, ...]:
     return tuple(sorted(levels, key=lambda level: (level.elevation, level.name)))
 
 
-def _apply(draft: Draft, entries: dict[PartKey, PartEntry], operation: Operation) -> Made | None:
+def compose_operation(draft: Draft, entries: dict[PartKey, PartEntry], operation: Operation) -> Made | None:
+    """Carry out an operation on a version's entries: its chunks are in the draft; None where there are none."""
     key = operation.key
     entry = entries.get(key)
     what = f"{key.layer} {key.name!r} on level {key.level!r}"

@@ -9,10 +9,10 @@ from typing import Any, Final, Literal
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
-from app.errors import Conflict, Invalid, NotFound, Problem, StaleParent, Unavailable
+from app.errors import Conflict, Damaged, Invalid, NotFound, Problem, StaleParent, Unavailable
 from app.model.frame import Datum, Level
 from app.model.templates import Templates, template_changes
-from app.store import chunks, index, outbox, tables
+from app.store import chunks, index, outbox, parts, tables
 from app.store.area import area_after, put_area
 from app.store.base import Base, clean, clean_problem, environment_row, nearest_channel, text, utcnow
 from app.store.changes import KEEP, Changes, Keep, Prepared
@@ -174,7 +174,15 @@ class Versions(Base):
 
         Raises Invalid where something cannot be stored, NotFound where something to delete is not there.
         """
-        return prepare(Draft(self._chunks), base, changes)
+        return prepare(Draft(self._chunks), base, changes, self._is_intact)
+
+    def _is_intact(self, part: str) -> bool:
+        """Whether the database has all chunks of a part, whatever is in memory."""
+        try:
+            names, _ = parts.all_chunks(Draft(self._chunks), bytes.fromhex(part), ())
+        except Damaged:
+            return False
+        return not self._chunks.damaged(sorted(names))
 
     def commit(
         self,
@@ -205,6 +213,7 @@ class Versions(Base):
             _check_head(row, prepared.base)
             now = utcnow()
             if not prepared.changed:
+                chunks.insert(connection, prepared.chunks)  # what was found damaged
                 _append_sources(connection, row.id, row.head, sources)
                 _remember(connection, row.id, idempotency, row.head, now)
                 return read_version(connection, row, row.head)

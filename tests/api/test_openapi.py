@@ -67,6 +67,7 @@ def test_every_address_of_the_contract(schema: dict[str, Any]) -> None:
         "/api/v1/jobs": "get", "/api/v1/jobs/{id}": "get delete",
         "/api/v1/tokens": "get post", "/api/v1/tokens/{id}": "delete",
         "/maps/{env}/{format}": "get", "/maps/{env}/{format}/{file}": "get",
+        "/api/v1/stored/{kind}/{sha256}": "get",
     }  # fmt: skip
     by_format = {f"/maps/{{env}}/{known.name}" for known in all_formats().values() if known.write}
     assert by_format < set(schema["paths"])
@@ -177,6 +178,7 @@ def test_every_example_works(api: Api, schema: dict[str, Any], tmp_path: Path) -
     known: dict[str, str] = {}
     job = api.app.state.services.store.create_job(owner="", detail="an example")
     known["/api/v1/jobs/{id}"] = job.id
+    known["/api/v1/stored/{kind}/{sha256}"] = api.app.state.services.store.blobs.put(b"an example")
     found = operations(schema)
     found.sort(key=lambda o: (LAST.index(_name(o)) if _name(o) in LAST else -1, ORDER.index(o[1])))
     ran = 0

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from app.convert.cache import Cache, Product
+from app.convert import cache as caching
+from app.convert.cache import Cache, LostMap, Product
 
 
 def key(text: str) -> str:
@@ -88,3 +92,140 @@ def test_what_a_killed_process_left_is_cleaned_at_the_next_start(tmp_path: Path)
     os.utime(tmp_path / "making-1", (0, 0))
     Cache(tmp_path, 10**6)
     assert not (tmp_path / "making-1").exists()
+
+
+def flip(path: Path, *, quietly: bool = False) -> None:
+    """Change a byte in the middle. quietly: as bit rot does, which no time tells."""
+    before, data = path.stat(), bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    if quietly:
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def zero(path: Path) -> None:
+    """What a power cut leaves of a file whose length alone was written."""
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+def entry(folder: Path, name: str) -> Path:
+    return folder / key(name)[:2] / key(name)
+
+
+@pytest.mark.parametrize("file", ["0", "whole", "map.json"])
+@pytest.mark.parametrize("harm", [flip, zero, lambda path: path.write_bytes(b""), Path.unlink])
+def test_a_damaged_entry_is_made_again_after_a_start(tmp_path: Path, file: str, harm: Callable[[Path], None]) -> None:
+    Cache(tmp_path, 10**6).get_or_make(key("a"), lambda: product(b"x" * 5000, archive=b"PK" * 50))
+    harm(entry(tmp_path, "a") / file)
+    cache = Cache(tmp_path, 10**6)
+    assert cache.get(key("a")) is None
+    assert cache.damaged == (0 if harm is Path.unlink and file == "map.json" else 1)
+    made = cache.get_or_make(key("a"), lambda: product(b"y" * 5000, archive=b"PK" * 50))
+    assert made.files[0].read() == b"y" * 5000
+    assert Cache(tmp_path, 10**6).get(key("a")) == made
+
+
+def test_an_entry_that_changes_while_the_server_runs_is_never_served(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, 10**6)
+    made = cache.get_or_make(key("a"), product)
+    flip(made.files[0].path, quietly=True)
+    with pytest.raises(LostMap):
+        made.files[0].read()
+    assert cache.damaged == 1
+    assert cache.get(key("a")) is None, "what was found damaged is gone"
+    made = cache.get_or_make(key("a"), product)
+    flip(made.files[0].path)
+    assert cache.get(key("a")) is None, "a file that was written to is hashed again"
+    assert cache.damaged == 2
+
+
+def test_an_entry_is_hashed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Cache(tmp_path, 10**6).get_or_make(key("a"), product)
+    hashed: list[Path] = []
+    real = caching._hash
+    monkeypatch.setattr(caching, "_hash", lambda path: (hashed.append(path), real(path))[1])
+    cache = Cache(tmp_path, 10**6)
+    for _ in range(5):
+        assert cache.get(key("a")) is not None
+    assert len(hashed) == 1
+
+
+def test_an_entry_under_another_key_is_not_served(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, 10**6)
+    cache.get_or_make(key("a"), product)
+    entry(tmp_path, "b").parent.mkdir(exist_ok=True)
+    entry(tmp_path, "a").rename(entry(tmp_path, "b"))
+    assert cache.get(key("b")) is None
+    assert cache.damaged == 1
+
+
+def test_an_entry_of_an_earlier_release_is_made_again_without_alarm(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, 10**6)
+    cache.get_or_make(key("a"), product)
+    described = entry(tmp_path, "a") / "map.json"
+    described.write_bytes(described.read_bytes().partition(b"\n")[2])
+    assert cache.get(key("a")) is None
+    assert cache.damaged == 0
+    assert cache.get_or_make(key("a"), product).files[0].read() == b"hello"
+
+
+def test_a_map_that_cannot_be_written_to_the_disk_itself_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[Path] = []
+    cache = Cache(tmp_path, 10**6)
+
+    def sync(path: Path) -> None:
+        if path.is_relative_to(tmp_path):  # tests before this one may still be syncing
+            synced.append(path)
+        if len(synced) > 4:
+            raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(caching, "sync", sync)
+    for name in "ab":
+        cache.get_or_make(key(name), product)
+    assert cache._syncing is not None
+    cache._syncing.shutdown(wait=True)
+    folder = entry(tmp_path, "a")
+    assert set(synced[:4]) == {folder / "0", folder / "map.json", folder, folder.parent}
+    assert cache.get(key("a")) is not None
+    assert cache.get(key("b")) is None
+
+
+def test_a_full_disk_does_not_stop_maps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    cache = Cache(tmp_path, 10**6)
+    stored = cache.get_or_make(key("before"), lambda: product(b"before"))
+    real, full = Path.mkdir, OSError(errno.ENOSPC, "No space left on device")
+
+    def mkdir(path: Path, *args: Any, **more: Any) -> None:
+        if path.name.startswith("making-"):
+            raise full
+        real(path, *args, **more)
+
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    for _ in range(2):
+        made = cache.get_or_make(key("a"), lambda: product(archive=b"PK"))
+        assert (made.files[0].read(), made.whole().read(), made.files[0].path) == (b"hello", b"PK", None)
+    assert cache.misses == 2, "it was made once"
+    assert cache.get(key("before")) == stored
+    with cache.holding() as hold:
+        assert [f.read() for f in (*hold(made).files, *hold(stored).files)] == [b"hello", b"before"]
+    assert cache.problem == "No space left on device"
+    assert [r.levelname for r in caplog.records] == ["ERROR"], "it is logged once"
+    monkeypatch.undo()
+    assert cache.get_or_make(key("b"), product).files[0].path is not None
+    assert cache.problem is None
+    assert cache.get(key("a")) is None
+
+
+def test_check_hashes_every_entry_and_removes_the_damaged_ones(tmp_path: Path) -> None:
+    cache = Cache(tmp_path, 10**6)
+    for name in "abc":
+        cache.get_or_make(key(name), product)
+    flip(entry(tmp_path, "b") / "0", quietly=True)
+    assert {k: cache.check(k) for k in cache.stored_keys()} == {
+        key("a"): (5, True), key("b"): (0, False), key("c"): (5, True)
+    }  # fmt: skip
+    assert cache.stored_keys() == sorted([key("a"), key("c")])

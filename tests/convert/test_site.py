@@ -12,7 +12,7 @@ import shapely
 
 from app import formats
 from app.convert import make, site
-from app.convert.cache import Cache, Product
+from app.convert.cache import Cache, LostMap, Product
 from app.convert.maps import file_of, joined
 from app.convert.recipe import Chain, Member, Recipe, Spread
 from app.errors import MissingLayer, NotFound
@@ -63,7 +63,7 @@ def test_held_files_outlive_the_cache(tmp_path: Path) -> None:
         cache.get_or_make("1" * 64, lambda: product("b.tif"))
         assert cache.get("0" * 64) is None
         assert held.files[0].path.read_bytes() == b"a.tif"
-        with pytest.raises(FileNotFoundError):
+        with pytest.raises(LostMap):
             hold(first)
     assert not held.files[0].path.exists()
 
@@ -71,7 +71,7 @@ def test_held_files_outlive_the_cache(tmp_path: Path) -> None:
 def test_linked_files_are_stored_as_they_are(tmp_path: Path) -> None:
     cache = Cache(tmp_path, 2**20)
     (file,) = cache.get_or_make("0" * 64, lambda: product("a.tif")).files
-    linked = Product({"L2/a.tif": (file.path, file.media_type)}, None, EMPTY, {"L2/a.tif": ("L2", "a")})
+    linked = Product({"L2/a.tif": (file, file.media_type)}, None, EMPTY, {"L2/a.tif": ("L2", "a")})
     (made,) = cache.get_or_make("1" * 64, lambda: linked).files
     assert (made.size, made.sha256, made.place) == (file.size, file.sha256, ("L2", "a"))
     assert made.path.read_bytes() == b"a.tif"

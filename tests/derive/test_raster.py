@@ -208,3 +208,13 @@ def test_many_triangles_are_quick() -> None:
     _raster.paint(grid, _raster.surfaces(triangles, frame, np.array([[0.2, 1.0]])), 100)
     assert grid.any()
     assert time.process_time() - start < 20
+
+
+@pytest.mark.parametrize("noise", [1e-16, 1e-15, -1e-15, 4e-15])
+def test_level_line_on_a_boundary_touches_whole_rows_in_spite_of_rounding(noise: float) -> None:
+    frame = Frame((0.0, 0.0), 1.0, 20, 10)
+    edge = np.array([[[1.5, 5.0 - noise], [18.5, 5.0 + noise]]])
+    rows, columns = np.nonzero(cells(_raster.lines(edge, frame), frame)[0])
+    for row in set(rows.tolist()):
+        assert columns[rows == row].tolist() == list(range(1, 19))
+    assert 5 in rows or 4 in rows

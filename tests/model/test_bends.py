@@ -145,7 +145,8 @@ def test_edited_pieces_stay_pieces() -> None:
 
 
 def test_formats_without_shapes_of_edges() -> None:
-    expected = ["ffr_network", "nav2_route", "navgraph", "openrmf", "prm", "rmf_nav_graph", "tmap", "tmap2"]
+    expected = ["ffr_network", "nav2_route", "navgraph", "openrmf", "prm", "rmf_nav_graph", "rmf_site"]
+    expected += ["tmap", "tmap2"]
     assert expected == STRAIGHT
 
 

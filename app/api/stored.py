@@ -1,0 +1,42 @@
+"""Stored bytes by their hash, for another server that has lost them (``fleetmap verify --repair --from URL``)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Path
+from starlette.responses import Response
+
+from app.api.access import ServerAdmin
+from app.api.answers import Route
+from app.api.schemas import told
+from app.api.services import Here
+from app.errors import Damaged, NotFound
+
+router = APIRouter(prefix="/stored", tags=["stored data"], route_class=Route)
+
+
+@router.get(
+    "/{kind}/{sha256}",
+    response_class=Response,
+    responses={
+        200: {"description": "The bytes", "content": {"application/octet-stream": {}}},
+        **told(None, 404),
+    },
+    summary="Stored bytes by their hash",
+)
+def stored(
+    kind: Annotated[
+        Literal["blobs", "chunks"],
+        Path(description="Uploaded files, or chunks of versions' content.", examples=["blobs"]),
+    ],
+    sha256: Annotated[str, Path(pattern="^[0-9a-f]{64}$", description="SHA-256 of the bytes, in hex.")],
+    here: Here,
+    _: ServerAdmin,
+) -> Response:
+    """What another server of the same data heals with. Takes an administrator's token for all environments."""
+    try:
+        data = here.store.blobs.get(sha256) if kind == "blobs" else here.store.chunk(sha256)
+    except Damaged as error:  # a chunk that was never here is the same as a lost one
+        raise NotFound(f"there are no such {kind}: {sha256}") from error
+    return Response(data, media_type="application/octet-stream")

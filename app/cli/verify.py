@@ -1,0 +1,261 @@
+"""``fleetmap verify``: everything that is stored against its hashes, and the repair of what is damaged."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from app.cli import local, options, output
+from app.cli.client import Client
+from app.cli.problems import Refused
+from app.errors import Damaged, FleetMapError, Invalid
+
+if TYPE_CHECKING:
+    from app.config import Settings
+    from app.ingest.repair import Donor
+    from app.store import Store
+    from app.store.verify import Finding, Verified
+
+REMOVED = "nowhere: it was removed, since no version has it"
+MAX_ROUNDS = 10
+"""How often it is checked again after a repair: a tree is repaired level by level."""
+
+MAX_VERSIONS = 5
+"""Versions that one line of the table names."""
+
+
+def verify(
+    repair: Annotated[bool, typer.Option("--repair", help="Replace what is damaged; history stays as it is.")] = False,
+    sources: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--from",
+            metavar="PLACE",
+            help="Where the same bytes may be: a file or folder of original files, another server's data folder, or "
+            "its address (with --token or FLEETMAP_TOKEN of an administrator); repeatable.",
+        ),
+    ] = None,
+    database_url: Annotated[
+        str | None, typer.Option("--database-url", help="The database [default: FLEETMAP_DATABASE_URL].")
+    ] = None,
+    data_dir: Annotated[
+        Path | None, typer.Option("--data-dir", help="The server's folder [default: FLEETMAP_DATA_DIR].")
+    ] = None,
+    blob_url: Annotated[
+        str | None, typer.Option("--blob-url", help="The folder of stored files [default: FLEETMAP_BLOB_URL].")
+    ] = None,
+    token: options.Token = None,
+    as_json: options.Json = False,
+) -> None:
+    """Check all stored data against its hashes.
+
+    Exit status 0: nothing is damaged (any more), 1: something is. It may run beside the server. Damaged cached maps are
+    removed, since they are made again anyway; nothing else is changed without --repair. Repair tries the places of
+    --from, then reads the uploads of damaged versions again:
+    `fleetmap verify --repair --from /backup/originals --from https://other-server`.
+    """
+    local.require_server_python("verify")
+    from app.cli.serving import load_settings
+    from app.convert.cache import Cache
+
+    if sources and not repair:
+        raise typer.BadParameter("--from goes with --repair")
+    settings = load_settings({"database_url": database_url, "data_dir": data_dir, "blob_url": blob_url})
+    if not settings.blob_dir.is_dir():
+        raise Invalid(f"{settings.blob_dir}: no folder of stored files is there: name the server's by --data-dir")
+    with ExitStack() as stack:
+        store = stack.enter_context(closing(_open(settings, readonly=not repair)))
+        found = _check(store)
+        left, healed = found.findings, dict[tuple[str, str], str]()
+        for _ in range(MAX_ROUNDS if repair else 0):
+            if not left:
+                break
+            donors = [_donor(place, token, left, stack) for place in sources or ()]
+            fresh = _repair(store, left, donors, settings)
+            if not fresh and not any(f.versions or f.kind != "chunk" for f in left):
+                fresh = {("chunk", name): REMOVED for name in store.remove_unused_chunks(left)}
+            if not fresh:
+                break
+            healed |= fresh
+            left = _check(store).findings  # what lay below a lost chunk is found only now
+            known = {(f.kind, f.name) for f in found.findings}
+            found.findings += [f for f in left if (f.kind, f.name) not in known]
+    for f in left:  # what a failing disk spoils again counts as damaged
+        healed.pop((f.kind, f.name), None)
+    cache = _check_cache(Cache(settings.cache_dir, settings.cache_bytes)) if settings.cache_dir.is_dir() else (0, 0)
+    if as_json:
+        output.show_json(_as_dict(found, healed, cache, ok=not left))
+    else:
+        _show(found, healed, cache, repaired=repair)
+    if left:
+        raise typer.Exit(1)
+
+
+def _open(settings: Settings, *, readonly: bool) -> Store:
+    from app.store import Store
+
+    return Store(settings.database, settings.blob_dir, readonly=readonly)
+
+
+def _check(store: Store) -> Verified:
+    with output.progress_bar("checking", count_bytes=True) as bar:
+        return store.verifier(lambda _, size: bar.advance(size)).run()
+    raise AssertionError("unreachable")
+
+
+def _check_cache(cache: Any) -> tuple[int, int]:
+    """How many cached maps there are, and how many were damaged; those are removed, and made again when requested."""
+    results = [cache.check(key)[1] for key in cache.stored_keys()]
+    return len(results), results.count(False)
+
+
+def _repair(
+    store: Store, findings: list[Finding], donors: list[Donor], settings: Settings
+) -> dict[tuple[str, str], str]:
+    from app.ingest.repair import repair
+    from app.main import allowed
+    from app.pool import Pool
+
+    seconds, memory = settings.max_seconds, settings.max_memory_bytes
+    pool = Pool(1, memory_bytes=memory, seconds=seconds, allowed=allowed(settings))
+    try:
+        with output.progress_bar("repairing"):
+            return repair(store, findings, donors, pool.run, settings.limits)
+        raise AssertionError("unreachable")
+    finally:
+        pool.close()
+
+
+class FolderDonor:
+    """Original files, below any names: what counts is their hash."""
+
+    def __init__(self, place: Path, wanted: set[str]) -> None:
+        import hashlib
+
+        self.name = str(place)
+        self._files: dict[str, Path] = {}
+        for path in _files(place):
+            with path.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            if digest in wanted:
+                self._files[digest] = path
+
+    def blob(self, sha256: str) -> bytes | None:
+        """The file's content, if one has this hash."""
+        path = self._files.get(sha256)
+        return None if path is None else path.read_bytes()
+
+    def chunk(self, sha256: str) -> bytes | None:
+        """A folder of files has no chunks."""
+        del sha256
+        return None
+
+
+class StoreDonor:
+    """Another server's data folder."""
+
+    def __init__(self, place: Path, store: Store) -> None:
+        self.name, self._store = str(place), store
+
+    def blob(self, sha256: str) -> bytes | None:
+        """The content, if it is there and intact."""
+        try:
+            return self._store.blobs.get(sha256)
+        except FleetMapError:
+            return None
+
+    def chunk(self, sha256: str) -> bytes | None:
+        """The bytes, if they are there and intact."""
+        try:
+            return self._store.chunk(sha256)
+        except Damaged:
+            return None
+
+
+class ServerDonor:
+    """Another server, by its address."""
+
+    def __init__(self, address: str, client: Client) -> None:
+        self.name, self._client = address, client
+
+    def blob(self, sha256: str) -> bytes | None:
+        """The content, if the server has it."""
+        return self._get("blobs", sha256)
+
+    def chunk(self, sha256: str) -> bytes | None:
+        """The bytes, if the server has them."""
+        return self._get("chunks", sha256)
+
+    def _get(self, kind: str, sha256: str) -> bytes | None:
+        try:
+            with self._client.download(f"/stored/{kind}/{sha256}") as found:
+                return found.path.read_bytes()
+        except Refused as refused:
+            if refused.problem.get("status") == 404:
+                return None
+            raise
+
+
+def _donor(place: str, token: str | None, findings: list[Finding], stack: ExitStack) -> Donor:
+    if place.startswith(("http://", "https://")):
+        return ServerDonor(place, stack.enter_context(Client(place, token)))
+    path = Path(place)
+    if not path.exists():
+        raise Invalid(f"--from {place}: there is no such file or folder")
+    database = path / "fleetmap.sqlite3"
+    if database.is_file():
+        from app.store import Store
+
+        store = Store(f"sqlite:///{database.resolve()}", path / "blobs", readonly=True)
+        return StoreDonor(path, stack.enter_context(closing(store)))
+    return FolderDonor(path, {f.name for f in findings if f.kind == "blob"})
+
+
+def _files(place: Path) -> Iterator[Path]:
+    if place.is_file():
+        yield place
+    for folder, _, names in os.walk(place):
+        yield from (path for name in names if (path := Path(folder) / name).is_file())
+
+
+def _as_dict(
+    found: Verified, healed: dict[tuple[str, str], str], cache: tuple[int, int], *, ok: bool
+) -> dict[str, Any]:
+    findings = [{**f.as_dict(), "repaired_from": healed.get((f.kind, f.name))} for f in found.findings]
+    return {
+        "ok": ok,
+        "checked": {**found.checked, "cache": cache[0]},
+        "bytes": found.size,
+        "findings": findings,
+        "cache_removed": cache[1],
+    }
+
+
+def _show(found: Verified, healed: dict[tuple[str, str], str], cache: tuple[int, int], *, repaired: bool) -> None:
+    counts = ", ".join(f"{count} {kind}s" for kind, count in found.checked.items() if kind != "database")
+    output.show(f"checked: {counts}, {cache[0]} cached maps")
+    if cache[1]:
+        output.show(f"{cache[1]} damaged cached maps were removed; they are made again when they are requested")
+    if not found.findings:
+        output.show("nothing is damaged")
+        return
+    rows = []
+    for f in found.findings:
+        versions = [f"{environment} {number}" for environment, number in f.versions]
+        more = f" and {len(versions) - MAX_VERSIONS} more" if len(versions) > MAX_VERSIONS else ""
+        where = ", ".join(versions[:MAX_VERSIONS]) + more or "of no version"
+        source = healed.get((f.kind, f.name))
+        rows.append((f"{f.kind} {f.name[:16]}", f.problem, where, f"repaired from {source}" if source else ""))
+    output.show_table(("what", "problem", "versions", "repair"), rows)
+    left = sum((f.kind, f.name) not in healed for f in found.findings)
+    if not left:
+        output.show("everything was repaired")
+    elif repaired:
+        output.show(f"{left} still damaged: name another place by --from, upload the files again, or restore a backup")
+    else:
+        output.show(f"{left} damaged: `fleetmap verify --repair` heals from uploads, and from places named by --from")

@@ -1,0 +1,193 @@
+"""Repair: damaged files and chunks replaced by the same bytes from elsewhere, which their hashes prove.
+
+Wherever bytes come from (a folder, another server, an upload read again), they are stored only under their own hash. So
+a repair cannot change history, and a wrong source does no harm.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import zipfile
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from app import bundle
+from app.bundle import Hints, Known
+from app.errors import Damaged, FleetMapError, NotFound
+from app.formats import Limits
+from app.ingest.prepare import fence_of, open_store, operation_for
+from app.model.layers import PartKey
+from app.store import Store
+from app.store.changes import Put
+from app.store.prepare import compose_operation
+from app.store.tree import Draft
+from app.store.values import PartEntry, Version
+from app.store.verify import Finding
+
+Run = Callable[..., Any]
+"""``run(function, *args)``: call a module-level function somewhere safe and return its result (``Pool.run``)."""
+
+
+class Donor(Protocol):
+    """Something that may have what was lost. name: for people."""
+
+    name: str
+
+    def blob(self, sha256: str) -> bytes | None:
+        """A file's content by its hash, if it is there."""
+        ...
+
+    def chunk(self, sha256: str) -> bytes | None:
+        """A chunk's canonical bytes by its hash, if they are there."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Rebuilt:
+    """What reading a version's uploads again gives: hash (hex) -> bytes."""
+
+    chunks: Mapping[str, bytes]
+    blobs: Mapping[str, bytes]
+
+
+def repair(
+    store: Store, findings: Iterable[Finding], donors: Sequence[Donor], run: Run, limits: Limits
+) -> dict[tuple[str, str], str]:
+    """Heal what can be healed: (kind, name) of a finding -> where its bytes came from.
+
+    What was only reachable through a lost chunk is found by the next verification.
+    """
+    blobs = {f.name: f for f in findings if f.kind == "blob"}
+    chunks = {f.name: f for f in findings if f.kind == "chunk"}
+    healed: dict[tuple[str, str], str] = {}
+    for donor in donors:
+        for name in [n for n in blobs if ("blob", n) not in healed]:
+            data = donor.blob(name)
+            if data is not None and store.blobs.put(data) == name:
+                healed["blob", name] = donor.name
+        for name in [n for n in chunks if ("chunk", n) not in healed]:
+            raw = donor.chunk(name)
+            with contextlib.suppress(Damaged):
+                if raw is not None:
+                    store.heal_chunks({name: raw})
+                    healed["chunk", name] = donor.name
+    for environment, number in sorted({v for f in (*blobs.values(), *chunks.values()) for v in f.versions}):
+        place = (environment, number)
+        lost_blobs = {n for n in blobs if ("blob", n) not in healed}
+        lost_chunks = {n for n in chunks if ("chunk", n) not in healed}
+        hit = [blobs[n] for n in lost_blobs] + [chunks[n] for n in lost_chunks]
+        if not any(place in finding.versions for finding in hit):
+            continue
+        where = f"the uploads of {environment} {number}"
+        arguments = (store.database_url, str(store.blob_dir), environment, number, lost_chunks, lost_blobs, limits)
+        try:
+            rebuilt: Rebuilt = run(read_again, *arguments)
+        except FleetMapError:
+            continue  # its uploads cannot be read: the finding stays
+        for data in rebuilt.blobs.values():
+            healed["blob", store.blobs.put(data)] = where
+        store.heal_chunks(rebuilt.chunks)
+        healed |= {("chunk", name): where for name in rebuilt.chunks}
+    return healed
+
+
+def read_again(
+    database_url: str,
+    blob_dir: str,
+    environment: str,
+    number: int,
+    lost_chunks: Collection[str],
+    lost_blobs: Collection[str],
+    limits: Limits,
+) -> Rebuilt:
+    """In a worker: the lost chunks and blobs that the uploaded files of a version give when they are read again.
+
+    How they were sent (as which layer, under which name) is not stored: the ways that the version's parts suggest are
+    tried until nothing is lost.
+    """
+    store = open_store(database_url, blob_dir)
+    version, base = store.version_and_base(environment, number)
+    files, found = _uploads(store, version, lost_blobs)
+    chunks: dict[str, bytes] = {}
+    for hints in _ways(version.parts):
+        if len(chunks) == len(lost_chunks) and len(found) == len(lost_blobs):
+            break
+        with contextlib.suppress(FleetMapError):
+            for draft, blobs in _composed(store, version, base, files, hints, limits):
+                chunks |= {n: draft.stream([bytes.fromhex(n)])[bytes.fromhex(n)] for n in _made(draft, lost_chunks)}
+                found |= {n: data for n, data in blobs.items() if n in lost_blobs}
+    return Rebuilt(chunks, found)
+
+
+def _uploads(store: Store, version: Version, lost: Collection[str]) -> tuple[dict[str, bytes], dict[str, bytes]]:
+    """The version's uploaded files, unpacked; and the lost ones that its archives have."""
+    files: dict[str, bytes] = {}
+    found: dict[str, bytes] = {}
+    for source in version.sources:
+        with contextlib.suppress(Damaged, NotFound):
+            data = store.blobs.get(source.sha256)
+            if source.format == "zip":
+                found |= _members(data, {s.sha256: s.size for s in version.sources if s.sha256 in lost})
+            else:
+                files[source.name] = data
+    for source in version.sources:
+        if source.sha256 in found:
+            files[source.name] = found[source.sha256]
+    return files, found
+
+
+def _members(data: bytes, wanted: Mapping[str, int]) -> dict[str, bytes]:
+    """The members of an archive that have one of these hashes (hash -> size)."""
+    out = {}
+    unreadable = (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, RuntimeError, OSError)
+    with contextlib.suppress(*unreadable), zipfile.ZipFile(io.BytesIO(data)) as archive:
+        for info in archive.infolist():
+            if info.file_size in wanted.values():
+                with archive.open(info) as member:
+                    content = member.read(info.file_size)
+                digest = hashlib.sha256(content).hexdigest()
+                if digest in wanted:
+                    out[digest] = content
+    return out
+
+
+def _ways(entries: Sequence[PartEntry]) -> Iterator[Hints]:
+    """How the files may have been sent."""
+    seen = [Hints()]
+    for entry in entries:
+        grid = entry.key.name if entry.key.layer == "occupancy" else None
+        form = entry.provenance.format or None
+        seen += [
+            Hints(form, layer, entry.key.level, name)
+            for layer in (None, entry.key.layer)
+            for name in dict.fromkeys((None, grid))
+        ]
+        seen += [Hints(None, layer, entry.key.level, grid) for layer in (None, entry.key.layer)]
+    for k, hints in enumerate(seen):
+        if hints not in seen[:k]:
+            yield hints
+
+
+def _composed(
+    store: Store, version: Version, base: Version | None, files: Mapping[str, bytes], hints: Hints, limits: Limits
+) -> Iterator[tuple[Draft, Mapping[str, bytes]]]:
+    """The chunks and blobs of the parts that files are read as, replaced or merged."""
+    start = version if base is None else base
+    told = bundle.read(files, hints, Known(start.datum or version.datum, fence_of(store, start)), limits)
+    entries: Mapping[PartKey, PartEntry] = {} if base is None else {e.key: e for e in base.parts}
+    for mode in ("replace", "merge"):
+        renamed: dict[str, dict[str, str]] = {}
+        for key in sorted(told.parts):
+            with contextlib.suppress(FleetMapError):
+                operation = operation_for(store, start, told, key, mode, files, renamed)
+                draft = store.draft()
+                kept = {key: entries[key]} if isinstance(operation, Put) and key in entries else {}
+                made = compose_operation(draft, dict(kept), operation)
+                yield draft, made.blobs if made is not None else {}
+
+
+def _made(draft: Draft, wanted: Collection[str]) -> list[str]:
+    return [n for n in wanted if bytes.fromhex(n) in draft.new or bytes.fromhex(n) in draft.stored]

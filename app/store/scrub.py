@@ -1,0 +1,188 @@
+"""The background scrub: stored bytes are hashed again, slowly, over and over, by one process of several.
+
+A pass reads SQLite's pages, chunks, versions' roots, files and a sample of the cache. How far it is stands in the blob
+folder, beside the lock that one process holds; a start goes on where the last one ended.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Final
+
+from app.errors import FleetMapError
+from app.store import Store
+from app.store.verify import KINDS, Kind, check_root
+
+log = logging.getLogger(__name__)
+
+LOCK: Final = ".scrub.lock"
+STATE: Final = ".scrub.json"
+POLL_SECONDS: Final = 60.0
+SAVE_SECONDS: Final = 10.0
+THING_BYTES: Final = 4096
+"""What checking a small thing counts as, since finding it costs more than hashing it."""
+
+CheckCache = Callable[[], Iterator[tuple[str, int, bool]]]
+"""(key, bytes, whether it was intact) of the cache's entries, one after the other."""
+
+
+@dataclass(slots=True)
+class ScrubState:
+    """How far a pass is. Times: seconds since 1970, 0.0 for never. after: the last hash of the step that was checked.
+
+    found: damaged things by kind, of the pass under way; findings: of the last complete pass, and at least ``found``.
+    """
+
+    step: int = 0
+    after: str = ""
+    started: float = 0.0
+    completed: float = 0.0
+    size: int = 0
+    found: dict[str, int] = field(default_factory=dict)
+    findings: dict[str, int] = field(default_factory=dict)
+
+
+def read_state(folder: Path) -> ScrubState:
+    """The state that whichever process scrubs has left in a blob folder."""
+    try:
+        members = json.loads((folder / STATE).read_bytes())
+        known = {f.name for f in fields(ScrubState)}
+        return ScrubState(**{name: value for name, value in members.items() if name in known})
+    except (OSError, ValueError, TypeError, AttributeError):
+        return ScrubState()
+
+
+class Scrub:
+    """Passes over a store in a thread of its own. every: seconds from one pass to the next. rate: bytes a second.
+
+    delay: seconds before the first pass, so that it does not slow down a start.
+    """
+
+    def __init__(
+        self, store: Store, check_cache: CheckCache, *, every: float, rate: int, delay: float = POLL_SECONDS
+    ) -> None:
+        self._store, self._check_cache = store, check_cache
+        self._every, self._rate, self._delay = every, rate, delay
+        self._stopped = threading.Event()
+        self._state = ScrubState()
+        self._saved = 0.0
+        self._debt = 0.0
+        self._thread = threading.Thread(target=self._run, daemon=True, name="fleetmap-scrub")
+
+    def start(self) -> None:
+        """Begin, where this process gets the lock."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop within a moment."""
+        self._stopped.set()
+        if self._thread.is_alive():
+            self._thread.join(5.0)
+
+    def _run(self) -> None:
+        self._stopped.wait(self._delay)
+        while not self._stopped.is_set():
+            try:
+                with (self._store.blob_dir / LOCK).open("w") as handle:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    while not self._stopped.is_set():
+                        self.pass_if_due()
+                        self._stopped.wait(POLL_SECONDS)
+            except BlockingIOError:
+                pass  # another process is at it
+            except (OSError, FleetMapError) as error:
+                log.warning("scrub: waits (reason=%s)", error)
+            self._stopped.wait(POLL_SECONDS)
+
+    def pass_if_due(self) -> None:
+        """Go on with a pass, or begin one where the last is long enough ago."""
+        self._state = read_state(self._store.blob_dir)
+        if not self._state.started and time.time() - self._state.completed < self._every:
+            return
+        if not self._state.started:
+            kept = (self._state.completed, self._state.findings)
+            self._state = ScrubState(started=time.time(), completed=kept[0], findings=kept[1])
+        steps = (self._pages, self._chunks, self._versions, self._blobs, self._cache)
+        while self._state.step < len(steps):
+            steps[self._state.step]()
+            if self._stopped.is_set():
+                self._save()
+                return
+            self._state.step, self._state.after = self._state.step + 1, ""
+        state = self._state
+        self._state = ScrubState(completed=time.time(), size=state.size, findings=state.found)
+        self._save()
+        log.info("scrub: complete (bytes=%d, findings=%s)", state.size, state.found or "none")
+
+    def _pages(self) -> None:
+        problem = self._store.check_pages()
+        if problem is not None:
+            self._note("database", "database", problem)
+
+    def _chunks(self) -> None:
+        for name, size, problem in self._store.verifier().chunks(self._state.after):
+            if not self._checked("chunk", name, size, problem):
+                return
+
+    def _versions(self) -> None:
+        for environment, row in self._store.verifier().versions():
+            problem, _ = check_root(row)
+            if not self._checked("version", f"{environment} {row.number}", len(row.manifest), problem):
+                return
+
+    def _blobs(self) -> None:
+        for name, size, problem in self._store.blobs.checked(self._state.after):
+            if not self._checked("blob", name, size, problem):
+                return
+
+    def _cache(self) -> None:
+        for key, size, intact in self._check_cache():
+            if not self._checked("cache", key, size, None if intact else "damaged; it is made again"):
+                return
+
+    def _checked(self, kind: Kind, name: str, size: int, problem: str | None) -> bool:
+        """Note what was checked and take the time for it; False where the scrub was stopped."""
+        if problem is not None:
+            self._note(kind, name, problem)
+        self._state.after = name
+        self._state.size += size
+        self._debt += max(size, THING_BYTES) / self._rate
+        if time.monotonic() - self._saved > SAVE_SECONDS:
+            self._save()
+        if self._debt > 0.05:  # slept in one piece rather than a microsecond at a time
+            self._stopped.wait(self._debt)
+            self._debt = 0.0
+        return not self._stopped.is_set()
+
+    def _note(self, kind: Kind, name: str, problem: str) -> None:
+        state = self._state
+        state.found[kind] = state.found.get(kind, 0) + 1
+        state.findings[kind] = max(state.findings.get(kind, 0), state.found[kind])
+        if kind != "cache":  # that one heals by itself
+            log.critical(
+                "scrub: stored data is damaged: run `fleetmap verify --repair` (%s=%s, %s)", kind, name, problem
+            )
+
+    def _save(self) -> None:
+        self._saved = time.monotonic()
+        path = self._store.blob_dir / STATE
+        temporary = path.with_suffix(f".{os.getpid()}")
+        with contextlib.suppress(OSError):  # a full disk stops no scrub
+            temporary.write_text(json.dumps(asdict(self._state)))
+            temporary.replace(path)
+
+
+def figures(state: ScrubState) -> dict[str, Any]:
+    """A state as monitoring reads it. age: seconds since the last complete pass, infinite where there was none."""
+    age = time.time() - state.completed if state.completed else float("inf")
+    findings = {kind: state.findings.get(kind, 0) for kind in KINDS}
+    return {"age": age, "completed": state.completed, "running": bool(state.started), "findings": findings}

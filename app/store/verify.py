@@ -1,0 +1,232 @@
+"""Verification: stored bytes against their hashes, versions' roots against their chunks. It reads and changes nothing.
+
+A version's root is the hash of its parts' hashes, a part's hash that of its first chunk, and each chunk names the next:
+where all chunks have their hashes and none is missing, every version is what it was when it was committed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
+
+from sqlalchemy import select
+
+from app.errors import Damaged, Unavailable
+from app.store import parts, tables
+from app.store.blobs import Blobs
+from app.store.chunks import Chunks
+from app.store.database import Database
+from app.store.manifest import unpack_manifest
+from app.store.prepare import version_root
+from app.store.tree import Draft, Node
+from app.store.values import PartEntry
+
+Kind = Literal["database", "blob", "chunk", "version", "cache"]
+KINDS: Final[tuple[Kind, ...]] = ("database", "chunk", "version", "blob", "cache")
+VersionName = tuple[str, int]
+"""Environment and number."""
+
+Progress = Callable[[Kind, int], None]
+"""Called after each checked thing with its kind and its bytes."""
+
+PAGE: Final = 200
+MAX_LINES: Final = 20
+_NOTHING: Final[frozenset[str]] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One damaged thing. name: a hash (hex), a version, or the database. versions: whose content it is part of."""
+
+    kind: Kind
+    name: str
+    problem: str
+    versions: tuple[VersionName, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        versions = [{"environment": name, "version": number} for name, number in self.versions]
+        return {"kind": self.kind, "name": self.name, "problem": self.problem, "versions": versions}
+
+
+@dataclass(slots=True)
+class Verified:
+    """What was checked (count by kind), and what was found."""
+
+    checked: dict[Kind, int] = field(default_factory=dict)
+    size: int = 0
+    findings: list[Finding] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class _Below:
+    """What a part refers to: chunks that are lost or damaged (hex), and blobs (hex)."""
+
+    bad: frozenset[str]
+    blobs: frozenset[str]
+
+
+class Verifier:
+    """Checks one store. It may run beside servers that write to it."""
+
+    def __init__(
+        self, database: Database, chunks: Chunks, blobs: Blobs, progress: Progress = lambda kind, size: None
+    ) -> None:
+        self._database, self._chunks, self._blobs, self._progress = database, chunks, blobs, progress
+
+    def run(self) -> Verified:
+        """Check everything. Unavailable where the database cannot be read at all."""
+        out = Verified()
+        problem = self._database.integrity(MAX_LINES, quick=False)
+        self._count(out, "database", 0)
+        if problem is not None:
+            out.findings.append(Finding("database", "database", problem))
+        try:
+            self._content(out)
+        except Unavailable as error:
+            if not out.findings:
+                raise
+            out.findings.append(Finding("database", "database", f"the check ended early: {error.detail}"))
+        return out
+
+    def _content(self, out: Verified) -> None:
+        bad: dict[str, str] = {}
+        present: set[bytes] = set()
+        for name, size, problem in self._chunks.checked():
+            self._count(out, "chunk", size)
+            present.add(name)
+            if problem is not None:
+                bad[name.hex()] = problem
+        walk = _Walk(self._chunks, bad, present)
+        chunk_users: dict[str, list[VersionName]] = {name: [] for name in bad}
+        blob_users: dict[str, list[VersionName]] = {}
+        for environment, row in self.versions():
+            version = (environment, int(row.number))
+            self._count(out, "version", len(row.manifest))
+            problem, entries = check_root(row)
+            if problem is not None:
+                out.findings.append(Finding("version", f"{environment} {row.number}", problem, (version,)))
+            for entry in entries:
+                below = walk.below(bytes.fromhex(entry.hash))
+                for chunk in below.bad:
+                    chunk_users.setdefault(chunk, []).append(version)
+                for blob in below.blobs:
+                    blob_users.setdefault(blob, []).append(version)
+        for chunk, users in chunk_users.items():
+            out.findings.append(Finding("chunk", chunk, bad.get(chunk, "lost"), tuple(dict.fromkeys(users))))
+        for environment, number, blob in self._sources():
+            blob_users.setdefault(blob, []).append((environment, number))
+        self._check_blobs(out, blob_users)
+
+    def _check_blobs(self, out: Verified, users: Mapping[str, list[VersionName]]) -> None:
+        missing = dict.fromkeys(users)
+        for name, size, problem in self._blobs.checked():
+            self._count(out, "blob", size)
+            missing.pop(name, None)
+            if problem is not None:
+                out.findings.append(Finding("blob", name, problem, tuple(dict.fromkeys(users.get(name, ())))))
+        for name in missing:
+            if not self._blobs.has(name):  # else it was stored meanwhile
+                out.findings.append(Finding("blob", name, "lost", tuple(dict.fromkeys(users[name]))))
+
+    def _count(self, out: Verified, kind: Kind, size: int) -> None:
+        out.checked[kind] = out.checked.get(kind, 0) + 1
+        out.size += size
+        self._progress(kind, size)
+
+    def chunks(self, after: str = "") -> Iterator[tuple[str, int, str | None]]:
+        """Hash one chunk after the other: (hash in hex, bytes, what is wrong with it or None)."""
+        for name, size, problem in self._chunks.checked(bytes.fromhex(after)):
+            yield name.hex(), size, problem
+
+    def versions(self) -> Iterator[tuple[str, Any]]:
+        """(environment, row) of every version, also of deleted environments."""
+        e, v = tables.environment, tables.version
+        columns = (e.c.name, e.c.id, v.c.number, v.c.root, v.c.manifest, e.c.head, e.c.root.label("head_root"))
+        query = select(*columns).join(v, v.c.environment_id == e.c.id).order_by(e.c.id, v.c.number).limit(PAGE)
+        environment, number = "", -1
+        while True:
+            later = (v.c.environment_id > environment) | ((v.c.environment_id == environment) & (v.c.number > number))
+            with self._database.read() as connection:
+                rows = connection.execute(query.where(later)).all()
+            for row in rows:
+                yield str(row.name), row
+            if len(rows) < PAGE:
+                return
+            environment, number = rows[-1].id, rows[-1].number
+
+    def _sources(self) -> list[tuple[str, int, str]]:
+        e, s = tables.environment, tables.source
+        query = select(e.c.name, s.c.number, s.c.sha256).join(s, s.c.environment_id == e.c.id)
+        with self._database.read() as connection:
+            return [(r.name, r.number, r.sha256) for r in connection.execute(query)]
+
+
+def check_root(row: Any) -> tuple[str | None, tuple[PartEntry, ...]]:
+    """What is wrong with a version's own row (None: nothing), and its parts."""
+    try:
+        datum, levels, entries, templates = unpack_manifest(bytes(row.manifest))
+        root = version_root(entries, datum, levels, templates)
+    except Damaged as error:
+        return error.detail, ()
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        return f"its manifest cannot be read ({type(error).__name__})", ()
+    if root != row.root:
+        return f"its manifest gives the root {root}, and {row.root} was committed", entries
+    if row.number == row.head and row.root != row.head_root:
+        return f"its environment takes {row.head_root} for its root, and {row.root} was committed", entries
+    return None, entries
+
+
+class _Walk:
+    """Through parts' trees, past what is damaged; each node once."""
+
+    def __init__(self, chunks: Chunks, bad: Mapping[str, str], present: set[bytes]) -> None:
+        self._chunks, self._bad, self._present = chunks, bad, present
+        self._parts: dict[bytes, _Below] = {}
+        self._nodes: dict[bytes, _Below] = {}
+
+    def below(self, part: bytes) -> _Below:
+        """What a part refers to."""
+        if part not in self._parts:
+            self._parts[part] = self._part(part)
+        return self._parts[part]
+
+    def _is_bad(self, name: bytes) -> bool:
+        if name not in self._present and not self._chunks.damaged([name]):
+            self._present.add(name)  # it was stored after its turn had come
+        return name not in self._present or name.hex() in self._bad
+
+    def _part(self, name: bytes) -> _Below:
+        if self._is_bad(name):
+            return _Below(frozenset({name.hex()}), _NOTHING)
+        draft = Draft(self._chunks)
+        root = parts.read_root(draft, name)
+        found = [self._node(draft, node, root.type) for node in root.trees.values() if node is not None]
+        documents = {h.hex() for h in parts.document_chunks(root) if self._is_bad(h)}
+        return _joined(found, documents)
+
+    def _node(self, draft: Draft, node: Node, kind: str) -> _Below:
+        known = self._nodes.get(node.hash)
+        if known is not None:
+            return known
+        if self._is_bad(node.hash):
+            found = _Below(frozenset({node.hash.hex()}), _NOTHING)
+        elif node.level:
+            children = draft.inner(node.hash).children()
+            found = _joined([self._node(draft, child, kind) for child in children], set())
+        elif kind in ("grid", "picture"):
+            (raw,) = draft.stream([node.hash]).values()
+            found = _joined([], {tile.hex() for _, tile in parts.tile_leaf(raw) if self._is_bad(tile)})
+        elif kind == "resources":
+            (raw,) = draft.stream([node.hash]).values()
+            found = _Below(_NOTHING, frozenset(h for _, _, h in parts.file_leaf(raw)))
+        else:
+            found = _Below(_NOTHING, _NOTHING)
+        self._nodes[node.hash] = found
+        return found
+
+
+def _joined(found: list[_Below], bad: set[str]) -> _Below:
+    return _Below(frozenset(bad).union(*(b.bad for b in found)), _NOTHING.union(*(b.blobs for b in found)))

@@ -1,0 +1,202 @@
+"""What verification finds, and the background scrub, on both databases."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+from sqlalchemy import exc
+
+from app.errors import Damaged, DatabaseDamaged, NoRoom, Unavailable
+from app.store import Store
+from app.store.changes import Changes
+from app.store.scrub import LOCK, Scrub, figures, read_state
+from app.store.values import Source
+from tests.store.samples import GRID, everything, grid, replaces, save
+
+
+def filled(store: Store) -> None:
+    """Two versions of everything, with sources: a large file and two packed ones."""
+    store.create_environment("farm")
+    names = store.blobs.put_many([b"b" * 100_000, b"small", b"other"])
+    sources = [Source(f"f{k}", 1, name) for k, name in enumerate(names)]
+    prepared = store.prepare(store.version("farm"), Changes(replaces(everything())))
+    store.commit("farm", prepared, author="ann", message="all", sources=sources)
+    save(store, "farm", *replaces({GRID: grid(seed=5)}))
+
+
+def spoil_chunk(store: Store, name: str, *, lose: bool = False) -> None:
+    mark = "?" if store.database_url.startswith("sqlite") else "%s"
+    with store._database.write() as connection:
+        if lose:
+            connection.exec_driver_sql(f"DELETE FROM chunk WHERE hash = {mark}", (bytes.fromhex(name),))
+        else:
+            statement = f"UPDATE chunk SET data = {mark} WHERE hash = {mark}"
+            connection.exec_driver_sql(statement, (b"spoilt", bytes.fromhex(name)))
+    store._chunks.forget()
+
+
+def test_verification_names_what_is_damaged_and_the_versions_it_hits(store: Store) -> None:
+    filled(store)
+    found = store.verifier().run()
+    assert found.findings == []
+    assert found.checked["version"] == 3
+    assert found.checked["blob"] >= 3
+    first, second = store.version("farm", 1), store.version("farm", 2)
+    only_first = first.part(GRID)
+    both = next(e for e in first.parts if e.key != GRID and e in second.parts)
+    assert only_first is not None
+    spoil_chunk(store, only_first.hash)
+    spoil_chunk(store, both.hash, lose=True)
+    big, small, _ = (s.sha256 for s in first.sources)
+    path = store.blobs.path(big)
+    assert path is not None
+    path.write_bytes(bytes(100_000))
+    (pack,) = [p for p in (store.blob_dir / "packs").iterdir() if b"small" in p.read_bytes()]
+    pack.write_bytes(pack.read_bytes().replace(b"small", b"smell"))
+    found = store.verifier().run()
+    told = {(f.kind, f.name): (f.problem, f.versions) for f in found.findings}
+    assert told == {
+        ("chunk", only_first.hash): ("damaged", (("farm", 1),)),
+        ("chunk", both.hash): ("lost", (("farm", 1), ("farm", 2))),
+        ("blob", big): ("damaged", (("farm", 1),)),
+        ("blob", small): ("damaged", (("farm", 1),)),
+    }
+    assert json.dumps([f.as_dict() for f in found.findings])
+    path.unlink()
+    assert ("blob", big, "lost") in {(f.kind, f.name, f.problem) for f in store.verifier().run().findings}
+    store.blobs.put_many([b"b" * 100_000, b"small", b"new"])
+    assert [f for f in store.verifier().run().findings if f.kind == "blob"] == [], "uploaded again: healed"
+
+
+def test_every_node_of_a_tree_counts(sqlite_store: Store) -> None:
+    filled(sqlite_store)
+    version = sqlite_store.version("farm", 2)
+    names = [name for name, _, _ in sqlite_store.verifier().chunks()][::7]
+    lost = 0
+    for name in names:
+        raw = sqlite_store.chunk(name)
+        spoil_chunk(sqlite_store, name, lose=True)
+        found = sqlite_store.verifier().run().findings
+        if found:
+            assert {f.name for f in found} == {name}
+            lost += ("farm", version.number) in found[0].versions
+        sqlite_store.heal_chunks({name: raw})
+    assert lost > len(names) // 2
+    assert sqlite_store.verifier().run().findings == []
+    with pytest.raises(Damaged):
+        sqlite_store.heal_chunks({names[0]: b"other bytes"})
+
+
+def test_a_changed_version_row_is_found(store: Store) -> None:
+    filled(store)
+    with store._database.write() as connection:
+        connection.exec_driver_sql("UPDATE version SET root = 'f' || substr(root, 2) WHERE number = 1")
+    (finding,) = store.verifier().run().findings
+    assert (finding.kind, finding.name, finding.versions) == ("version", "farm 1", (("farm", 1),))
+    assert "was committed" in finding.problem
+
+
+def test_the_scrub_finds_damage_goes_on_after_a_stop_and_tells_its_age(store: Store) -> None:
+    filled(store)
+    entry = store.version("farm", 1).part(GRID)
+    assert entry is not None
+    spoil_chunk(store, entry.hash)
+    assert figures(read_state(store.blob_dir))["age"] == float("inf")
+    cache = [("00", 10, True), ("01", 0, False)]
+    scrub = Scrub(store, lambda: iter(cache), every=3600, rate=10**9)
+    scrub._stopped.set()  # it is stopped within the first step
+    scrub.pass_if_due()
+    begun = read_state(store.blob_dir)
+    assert begun.started
+    assert not begun.completed
+    scrub = Scrub(store, lambda: iter(cache), every=3600, rate=10**9)
+    scrub.pass_if_due()
+    state = read_state(store.blob_dir)
+    assert state.findings == {"chunk": 1, "cache": 1}
+    assert state.size > 100_000
+    assert 0 <= figures(state)["age"] < 60
+    scrub.pass_if_due()
+    assert read_state(store.blob_dir) == state, "the next pass is not due yet"
+
+
+def test_one_process_scrubs(sqlite_store: Store) -> None:
+    scrubs = [Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9, delay=0.0) for _ in range(2)]
+    for scrub in scrubs:
+        scrub.start()
+    deadline = time.monotonic() + 30
+    while not read_state(sqlite_store.blob_dir).completed:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    for scrub in scrubs:
+        scrub.close()
+    assert (sqlite_store.blob_dir / LOCK).exists()
+
+
+def test_a_rate_bounds_the_scrub(sqlite_store: Store) -> None:
+    sqlite_store.blobs.put(b"x" * 40_000)
+    waited: list[float] = []
+    scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=100_000)
+    scrub._stopped.wait = lambda seconds=None: bool(waited.append(seconds or 0.0))  # type: ignore[method-assign]
+    scrub.pass_if_due()
+    assert sum(waited) >= 0.4
+
+
+def test_database_errors_say_what_to_do(tmp_path: Path) -> None:
+    file = tmp_path / "some.sqlite"
+    for content, kind, text in ((b"no database at all" * 500, DatabaseDamaged, "fleetmap verify"),):
+        file.write_bytes(content)
+        store = Store(f"sqlite:///{file}", tmp_path / "blobs")
+        with pytest.raises(kind, match=text) as raised:
+            store.environments()
+        assert "some.sqlite" in raised.value.detail
+        store.close()
+    file.unlink()
+    with pytest.raises(DatabaseDamaged, match="missing"):
+        Store(f"sqlite:///{file}", tmp_path / "blobs", readonly=True).environments()
+    assert not file.exists()
+    folder = tmp_path / "folder.sqlite"
+    folder.mkdir()
+    store = Store(f"sqlite:///{folder}", tmp_path / "blobs")
+    with pytest.raises(Unavailable, match="check the file"):
+        store.environments()
+    store.close()
+
+
+def test_a_full_and_a_read_only_database_refuse_writes(sqlite_store: Store) -> None:
+    sqlite_store.create_environment("farm")
+    with sqlite_store._database.read() as connection:
+        pages = connection.exec_driver_sql("PRAGMA page_count").scalar_one()
+
+    def limit(connection: object, *_: object) -> None:
+        connection.exec_driver_sql(f"PRAGMA max_page_count={pages}")  # type: ignore[attr-defined]
+
+    from sqlalchemy import event
+
+    sqlite_store._database.engine.dispose()
+    event.listen(sqlite_store._database.engine, "begin", limit)
+    with pytest.raises(NoRoom, match="room"):
+        save(sqlite_store, "farm", *replaces(everything()))
+    event.remove(sqlite_store._database.engine, "begin", limit)
+    assert sqlite_store.version("farm").number == 0
+    reading = Store(sqlite_store.database_url, sqlite_store.blob_dir, readonly=True)
+    with pytest.raises(Unavailable, match="cannot be written"):
+        reading.create_environment("other")
+    reading.close()
+
+
+@pytest.mark.parametrize(
+    ("state", "kind"),
+    [("XX001", DatabaseDamaged), ("XX002", DatabaseDamaged), ("58P01", DatabaseDamaged), ("53100", NoRoom)],
+)
+def test_errors_of_postgresql_have_their_meaning(sqlite_store: Store, state: str, kind: type[Unavailable]) -> None:
+    class Refused(Exception):
+        sqlstate = state
+
+    with pytest.raises(kind), sqlite_store._database.read():
+        raise exc.InternalError("SELECT 1", {}, Refused("invalid page in block 3 of relation base/5/16385"))
+    if kind is DatabaseDamaged:
+        with pytest.raises(DatabaseDamaged, match="fleetmap verify"):
+            sqlite_store.check()
