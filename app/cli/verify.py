@@ -140,10 +140,12 @@ class FolderDonor:
         self.name = str(place)
         self._files: dict[str, Path] = {}
         for path in _files(place):
+            sha256 = hashlib.sha256()
             with path.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            if digest in wanted:
-                self._files[digest] = path
+                while block := file.read(2**20):
+                    sha256.update(block)
+            if sha256.hexdigest() in wanted:
+                self._files[sha256.hexdigest()] = path
 
     def blob(self, sha256: str) -> bytes | None:
         """The file's content, if one has this hash."""
