@@ -69,7 +69,7 @@ from app.api.services import ApiOptions, Services
 from app.api.signed import SignedLinks
 from app.api.uploads import Intake
 from app.config import Settings
-from app.convert import Maps
+from app.convert.maps import Maps
 from app.errors import Conflict, DatabaseDamaged, FleetMapError, NoRoom, Unavailable
 from app.events import bus
 from app.events.bus import Bus, BusOptions
@@ -85,8 +85,8 @@ from app.links import LinkSecrets
 from app.pool import Pool
 from app.sandbox import Allowed
 from app.signing import Keys
-from app.store import Store
 from app.store.scrub import Scrub
+from app.store.store import Store
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ import pytest
 from pyproj import Transformer
 
 from app.formats import _archive
-from app.store import Store
+from app.store.store import Store
 from tests.api.conftest import Api, running, settings_for
 from tests.postgres import Cluster
 

@@ -6,7 +6,7 @@ import pytest
 
 from app import formats, parameters, templates
 from app.bundle import Hints
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import Invalid
 from app.formats import Group, ReadContext
 from app.model.features import Features

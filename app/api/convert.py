@@ -22,7 +22,7 @@ from app.api.services import Here, Services
 from app.api.uploads import Form
 from app.api.versions import check_names, format_named, truth
 from app.bundle import DRAWN_LAYERS, Hints, drawn_layer
-from app.convert import Converted
+from app.convert.files import Converted
 from app.convert.make import media_type, zipped
 from app.errors import Invalid, Problem
 from app.ingest.service import check_grid_name

@@ -21,11 +21,12 @@ from app.api.access import Principal, Viewer
 from app.api.answers import Route, answer, path_of
 from app.api.schemas import JobOut, JobPath, Limit, told
 from app.api.services import Here
-from app.convert import Maps, Recipe
 from app.convert.cache import Made
+from app.convert.maps import Maps
+from app.convert.recipe import Recipe
 from app.errors import FleetMapError, NoRoom, NotFound, Unavailable
 from app.pool import Cancelled, Stop
-from app.store import Store
+from app.store.store import Store
 from app.store.values import Job, State, rfc3339
 
 log = logging.getLogger(__name__)

@@ -23,9 +23,9 @@ from app.api.jobs import Started, started
 from app.api.maps import address_of, number_of, options_of
 from app.api.schemas import ClosuresQuery, EnvironmentPath, KeyOut, ManifestOut, VersionPath, told
 from app.api.services import Here, Services
-from app.convert import Recipe, site
+from app.convert import site
 from app.convert.cache import Made
-from app.convert.recipe import own_options
+from app.convert.recipe import Recipe, own_options
 from app.errors import CannotConvert, CannotDerive, FleetMapError, Invalid, NotFound, Problem
 from app.events.messages import SIGNATURE
 from app.model.closures import NO_CLOSURES, ClosureMode

@@ -37,9 +37,9 @@ from app.api.schemas import CoverageOut, EnvironmentPath, FormatPath, ReportOut,
 from app.api.services import Here, Services
 from app.api.signed import LINK
 from app.api.together import Together
-from app.convert import Recipe
 from app.convert.cache import LostMap, Made, MadeFile
 from app.convert.maps import file_of
+from app.convert.recipe import Recipe
 from app.errors import CannotDerive, Invalid, NotFound, Problem, Unavailable
 from app.links import SignedAddress
 from app.model.closures import CLOSURE_MODES, ClosureMode

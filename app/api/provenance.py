@@ -14,7 +14,7 @@ from app.api.answers import Route, answer
 from app.api.maps import number_of
 from app.api.schemas import EnvironmentPath, ProvenanceOut, VersionPath, told
 from app.api.services import Here
-from app.convert import Maps
+from app.convert.maps import Maps
 from app.store.values import Version
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["versions"], route_class=Route)

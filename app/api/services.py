@@ -11,13 +11,13 @@ from fastapi import Depends, Request
 
 from app.api.access import Access
 from app.api.signed import SignedLinks
-from app.convert import Maps
+from app.convert.maps import Maps
 from app.fleet import Intake as FleetIntake
 from app.formats import Limits
 from app.ingest import Ingest
 from app.pool import Pool
 from app.signing import Keys
-from app.store import Store
+from app.store.store import Store
 
 if TYPE_CHECKING:
     from app.api.deltas import Deltas

@@ -133,7 +133,7 @@ def _write(
 ) -> None:
     local.require_server_python("generate --to")
     from app import formats, generate, parameters
-    from app.convert import written
+    from app.convert.files import written
     from app.derive import Notes
     from app.model.layers import Layers
     from app.store.values import Provenance

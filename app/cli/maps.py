@@ -188,7 +188,7 @@ def convert(
     local.require_server_python("convert")
     from app import formats, parameters
     from app.bundle import Hints, drawn_layer
-    from app.convert import offline
+    from app.convert.files import offline
     from app.derive import all_derivations, takes
 
     if out == "-" and as_json:

@@ -312,7 +312,7 @@ def with_demo_token(settings: Settings) -> Settings:
 def _store(settings: Settings) -> Any:
     from contextlib import closing
 
-    from app.store import Store
+    from app.store.store import Store
 
     try:
         settings.data_dir.mkdir(parents=True, exist_ok=True)

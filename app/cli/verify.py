@@ -18,7 +18,7 @@ from app.errors import Damaged, FleetMapError, Invalid
 if TYPE_CHECKING:
     from app.config import Settings
     from app.ingest.repair import Donor
-    from app.store import Store
+    from app.store.store import Store
     from app.store.verify import Finding, Verified
 
 REMOVED = "nowhere: it was removed, since no version has it"
@@ -97,7 +97,7 @@ def verify(
 
 
 def _open(settings: Settings, *, readonly: bool) -> Store:
-    from app.store import Store
+    from app.store.store import Store
 
     return Store(settings.database, settings.blob_dir, readonly=readonly)
 
@@ -211,7 +211,7 @@ def _donor(place: str, token: str | None, findings: list[Finding], stack: ExitSt
         raise Invalid(f"--from {place}: there is no such file or folder")
     database = path / "fleetmap.sqlite3"
     if database.is_file():
-        from app.store import Store
+        from app.store.store import Store
 
         store = Store(f"sqlite:///{database.resolve()}", path / "blobs", readonly=True)
         return StoreDonor(path, stack.enter_context(closing(store)))

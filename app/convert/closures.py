@@ -10,7 +10,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
@@ -20,15 +20,16 @@ from numpy.typing import NDArray
 
 from app.errors import FleetMapError
 from app.formats import Format
-from app.model.closures import Closure, ClosureMode, Closures, digest_of
+from app.model.closures import Closure, ClosureMode, Closures, digest_of, zone_id
 from app.model.features import Features, concatenate, features
 from app.model.frame import Anchor, Datum
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import FREE, OCCUPIED, OccupancyGrid
 from app.model.layers import Layers, Part, PartKey
-from app.store import Store
-from app.store.overlays import zone_id
 from app.store.values import Bounds, Box, PartEntry, Provenance, Version
+
+if TYPE_CHECKING:
+    from app.store.store import Store
 
 PART_NAME = "closures in force"
 KEEPOUT = "keepout"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from app import derive, formats, parameters
 from app.convert import closures as applied_closures
@@ -24,9 +24,11 @@ from app.model.features import Features
 from app.model.frame import GROUND
 from app.model.layers import LAYERS, VECTOR_LAYERS, Layer, Layers, PartKey
 from app.model.templates import NO_TEMPLATES, Templates
-from app.store import Store
 from app.store.values import PartEntry, Provenance, Version, datum_information
 from app.templates import DEFAULT, resolve
+
+if TYPE_CHECKING:
+    from app.store.store import Store
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +44,8 @@ class Written:
 @lru_cache(maxsize=4)
 def open_store(database_url: str, blob_dir: str) -> Store:
     """A worker's own view of the store, kept between jobs."""
+    from app.store.store import Store  # converting files needs no database
+
     return Store(database_url, Path(blob_dir), readonly=True)
 
 

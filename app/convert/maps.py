@@ -38,7 +38,7 @@ from app.model.frame import Datum
 from app.model.layers import Layers, PartKey
 from app.model.names import did_you_mean
 from app.pool import Stop, WorkerDied
-from app.store import Store
+from app.store.store import Store
 from app.store.values import Version
 
 Run = Callable[..., Any]

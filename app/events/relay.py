@@ -14,7 +14,7 @@ from typing import Any
 from app.events import single
 from app.events.bus import HISTORY, Bus
 from app.events.single import POLL_SECONDS, Single
-from app.store import Store
+from app.store.store import Store
 from app.store.values import Event
 
 LOOK_SECONDS = 0.004

@@ -9,10 +9,10 @@ from typing import Any
 import shapely
 
 from app.errors import Invalid, Problem
+from app.model.closures import zone_id
 from app.model.features import Feature
 from app.model.layers import PartKey
-from app.store import Store
-from app.store.overlays import zone_id
+from app.store.store import Store
 from app.store.values import Overlay, Version
 
 BLOCKED, UNTIL = "blocked", "blocked_until"

@@ -25,8 +25,8 @@ from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid, without_unknown_grey
 from app.model.layers import NETWORK, SITE, VECTOR_LAYERS, ZONES, Layer, PartKey, join_levels
 from app.model.names import did_you_mean
-from app.store import Store
 from app.store.changes import KEEP, Changes, Delete, Provenance, Put, Replace
+from app.store.store import Store
 from app.store.values import Version
 
 EDITED = Provenance("raw", "edit")

@@ -12,7 +12,7 @@ import shapely
 
 from app.model.features import Features
 from app.model.layers import PartKey
-from app.store import Store
+from app.store.store import Store
 from app.store.values import Version
 
 OWN_IDS = frozenset({"osm"})

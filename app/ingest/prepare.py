@@ -25,8 +25,8 @@ from app.model.frame import Datum, Level
 from app.model.grid import UNKNOWN, OccupancyGrid
 from app.model.imagery import Picture
 from app.model.layers import Part, PartKey, Resources, cloud_name, join_levels
-from app.store import Store
 from app.store.changes import KEEP, Changes, Drop, Operation, Prepared, Provenance, Put, Replace
+from app.store.store import Store
 from app.store.values import Version
 
 Mode = Literal["replace", "merge"]

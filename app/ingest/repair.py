@@ -20,9 +20,9 @@ from app.errors import Damaged, FleetMapError, NotFound
 from app.formats import Limits
 from app.ingest.prepare import fence_of, open_store, operation_for
 from app.model.layers import PartKey
-from app.store import Store
 from app.store.changes import Put
 from app.store.prepare import compose_operation
+from app.store.store import Store
 from app.store.tree import Draft
 from app.store.values import PartEntry, Version
 from app.store.verify import Finding

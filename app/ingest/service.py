@@ -27,8 +27,8 @@ from app.ingest.templates import TemplateWish
 from app.model.frame import GROUND, Datum
 from app.model.layers import Layer
 from app.pool import WorkerDied
-from app.store import Store
 from app.store.changes import KEEP, Changes, Prepared
+from app.store.store import Store
 from app.store.values import Idempotency, Source, Version
 
 Run = Callable[..., Any]

@@ -70,3 +70,8 @@ def digest_of(closures: list[dict[str, Any]]) -> str:
 
 
 NO_CLOSURES = Closures()
+
+
+def zone_id(overlay_id: str) -> str:
+    """Return the id of the zone that stands for an overlay's polygon."""
+    return f"overlay-{overlay_id}"

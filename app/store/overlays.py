@@ -202,11 +202,6 @@ def _read_closures(connection: Connection, environment: Row[Any]) -> Closures:
     return Closures(tuple(_as_overlay(environment.name, row).closure for row in rows))
 
 
-def zone_id(overlay_id: str) -> str:
-    """Return the id of the zone that stands for an overlay's polygon."""
-    return f"overlay-{overlay_id}"
-
-
 def _require_room(connection: Connection, environment: Row[Any], overlay: Overlay) -> None:
     """Raise Conflict if another closure would make manifests too large."""
     table = tables.overlay

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from app.errors import FleetMapError
-from app.store import Store
+from app.store.store import Store
 from app.store.verify import KINDS, Kind, check_root
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from lxml import etree
 
 from app import formats
 from app.bundle import Hints
-from app.convert import offline
+from app.convert.files import offline
 from app.model.frame import Datum
 from tests.api.conftest import Api
 

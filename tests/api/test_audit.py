@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from app.logs import REQUEST_ID, JsonFormatter, TextFormatter
-from app.store import Store
 from app.store.audit import CALLER, Caller
+from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import ADMIN, Api
 

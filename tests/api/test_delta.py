@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.store import Store
+from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 from tests.postgres import postgres_cluster, postgres_url

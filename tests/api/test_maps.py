@@ -76,7 +76,7 @@ def test_the_same_again_is_304(api: Api, farm: str) -> None:
 def test_repeated_requests_are_answered_from_memory(api: Api, farm: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """For a second neither database nor disk is asked; then the answer must be confirmed."""
     from app.errors import Unavailable
-    from app.store import Store
+    from app.store.store import Store
 
     def away(*_: object) -> None:
         raise Unavailable("the database is away")
@@ -342,7 +342,7 @@ def test_memory_is_bounded(tmp_path: Path) -> None:
 
 
 def test_work_that_takes_long_becomes_a_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from app.convert import Maps
+    from app.convert.maps import Maps
 
     quick, gate = Maps.make, threading.Event()
 
@@ -383,7 +383,7 @@ def test_work_that_takes_long_becomes_a_job(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_job_is_cancelled_or_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from app.convert import Maps
+    from app.convert.maps import Maps
     from app.errors import CannotConvert
 
     gate = threading.Event()
@@ -457,7 +457,7 @@ def test_cancelling_stops_the_work_unless_others_wait_for_it(tmp_path: Path, mon
 
 
 def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from app.convert import Maps
+    from app.convert.maps import Maps
     from app.pool import Stop
 
     stopped = threading.Event()

@@ -9,7 +9,7 @@ import pytest
 
 from app.errors import Unavailable
 from app.main import open_services
-from app.store import Store
+from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 from tests.api.test_writers import races

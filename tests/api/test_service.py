@@ -366,7 +366,7 @@ def test_health_and_metrics(api: Api, farm: str) -> None:
 
 def test_not_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.errors import Unavailable
-    from app.store import Store
+    from app.store.store import Store
 
     with running(settings_for(tmp_path)) as api:
 
@@ -409,7 +409,7 @@ def test_errors_have_one_shape(api: Api, method: str, path: str, status: int, mo
 def test_a_bug_tells_nothing(
     api: Api, bare: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from app.store import Store
+    from app.store.store import Store
 
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("secret /etc/path and token")

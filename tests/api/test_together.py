@@ -16,8 +16,8 @@ from app.api import channels, maps
 from app.api.access import Access
 from app.api.together import Together
 from app.errors import NotFound, Unavailable
-from app.store import Store
 from app.store.database import Database
+from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api
 

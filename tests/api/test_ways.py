@@ -10,7 +10,7 @@ import pytest
 
 from app import derive
 from app.bundle import Hints
-from app.convert import offline
+from app.convert.files import offline
 from app.derive import Notes, derives
 from app.errors import CannotConvert, CannotDerive, Invalid, MissingLayer
 from app.model.grid import FREE, OCCUPIED, OccupancyGrid

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from app import bundle
 from app.bundle import Hints
-from app.convert import offline
+from app.convert.files import offline
 from app.formats import Limits
 from app.model.frame import Datum
 from app.model.grid import OccupancyGrid

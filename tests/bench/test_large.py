@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from app.convert import offline
+from app.convert.files import offline
 from app.model.features import Features
 from app.model.grid import OccupancyGrid
 from tests.bench import derived

@@ -20,7 +20,7 @@ import zenoh
 
 from app.events.bus import BusOptions, router_configuration
 from app.events.router import Router
-from app.store import Store
+from app.store.store import Store
 from tests.agent.conftest import ROOT, Robot, network
 from tests.api.conftest import ADMIN
 from tests.cli.conftest import ServerProcess

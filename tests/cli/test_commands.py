@@ -7,6 +7,7 @@ import os
 import shlex
 import shutil
 import subprocess
+import sys
 import urllib.request
 import zipfile
 from pathlib import Path
@@ -336,3 +337,20 @@ def test_the_demo_comes_once_and_its_commands_work(fleetmap: Fleetmap, server: s
 
 def run_curl(line: str) -> bytes:
     return subprocess.run([*shlex.split(line), "--silent"], capture_output=True, timeout=60, check=True).stdout
+
+
+def test_light_install_converts_without_the_packages_of_the_server(tmp_path: Path) -> None:
+    """``[convert]`` has no numba, OpenCV, SciPy, SQLAlchemy, FastAPI or pydantic."""
+    script = (
+        "import sys\n"
+        "for name in ('numba', 'cv2', 'scipy', 'sqlalchemy', 'geoalchemy2', 'fastapi', 'uvicorn', 'pydantic'):\n"
+        "    sys.modules[name] = None\n"
+        "from app.cli import run\n"
+        "sys.exit(run(sys.argv[1:]))\n"
+    )
+    root = Path(__file__).resolve().parents[2]
+    network = root / "tests/samples/tmap2/orchard.tmap2.yaml"
+    command = [sys.executable, "-c", script, "convert", str(network), "--to", "geojson", "-o", str(tmp_path / "a.json")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=root)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "a.json").read_text())["features"]

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app import derive, formats
-from app.convert import offline
+from app.convert.files import offline
 from app.derive import occupancy_to_voxels as module
 from app.derive.occupancy_to_voxels import Parameters, occupancy_to_voxels
 from app.derive.voxels_to_occupancy import Parameters as Back

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app import derive, formats
-from app.convert import offline
+from app.convert.files import offline
 from app.derive.voxels_to_occupancy import Parameters, voxels_to_occupancy
 from app.errors import CannotConvert, MissingLayer
 from app.formats import Group, ReadContext, get_format

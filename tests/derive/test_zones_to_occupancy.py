@@ -15,7 +15,7 @@ import yaml
 
 from app import derive
 from app.bundle import Hints
-from app.convert import offline
+from app.convert.files import offline
 from app.derive import Notes
 from app.derive.zones_to_occupancy import Parameters, zones_to_occupancy
 from app.errors import CannotConvert, MissingDatum, MissingLayer, NotFound

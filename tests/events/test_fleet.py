@@ -14,7 +14,7 @@ import zenoh
 
 from app.errors import Unavailable
 from app.fleet import Intake
-from app.store import Store
+from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api
 from tests.events.conftest import client_config, eventually, said

@@ -19,7 +19,7 @@ from app.events.bus import Bus, BusOptions, router_configuration
 from app.events.messages import Event, RobotStatus
 from app.events.relay import Relay, state_of
 from app.events.router import Router
-from app.store import Store
+from app.store.store import Store
 from tests.api import samples
 from tests.api.conftest import Api, running, settings_for
 from tests.events.conftest import Listener, client_config, eventually, free_port, nothing

@@ -20,7 +20,8 @@ import shapely
 from app import bundle, formats
 from app.bundle import Bundle, Hints, Known
 from app.convert import make as making
-from app.convert import offline, recipe
+from app.convert import recipe
+from app.convert.files import offline
 from app.errors import BadUpload, CannotConvert, MissingLayer
 from app.formats import Limits, WriteContext, _archive, _shell, get_format
 from app.formats.environment import MAIN, detect

@@ -11,7 +11,7 @@ import shapely
 
 from app import formats
 from app.bundle import Hints, Known, read, unpack
-from app.convert import offline
+from app.convert.files import offline
 from app.convert.make import from_layers
 from app.errors import BadUpload, CannotConvert, Invalid, MissingLayer
 from app.formats import Limits

@@ -11,7 +11,7 @@ import shapely
 import yaml
 
 from app import formats
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import BadUpload
 from app.formats import Group, ReadContext, WriteContext, get_format
 from app.model.features import Features, features

@@ -23,7 +23,7 @@ from lxml import etree
 from app import formats
 from app.bundle import Bundle, Hints, Known, unpack
 from app.bundle import read as read_bundle
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import Ambiguous, BadUpload, MissingDatum, MissingLayer, NotFound, TooLarge, UnreadableFile
 from app.formats import Limits, WriteContext, _sdf, _sdf_bodies, gazebo, get_format
 from app.formats.gazebo import WriteOptions

@@ -16,7 +16,7 @@ import pyproj
 import pytest
 from lxml import etree
 
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import BadUpload, TooLarge, UnreadableFile
 from app.formats import (
     Group,

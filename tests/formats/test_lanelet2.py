@@ -20,7 +20,7 @@ from lxml import etree
 from app import formats
 from app.bundle import Hints, Known
 from app.bundle import read as read_bundle
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, TooLarge, UnreadableFile
 from app.formats import Group, Limits, ReadContext, WriteContext, _osm, get_format
 from app.formats.lanelet2 import MAIN, PROJECTOR, WriteOptions, detect, speed_of, two_way

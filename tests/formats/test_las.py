@@ -18,7 +18,7 @@ from pyproj import CRS, Transformer
 from app import formats
 from app.bundle import Hints, Known
 from app.bundle import read as read_bundle
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import BadUpload, TooLarge, UnreadableFile
 from app.formats import Group, Limits, ReadContext, get_format
 from app.model.frame import Datum

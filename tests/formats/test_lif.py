@@ -14,7 +14,7 @@ import shapely
 
 from app import formats
 from app.bundle import Hints
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import CannotConvert, MissingDatum, TooLarge, UnreadableFile
 from app.formats import Group, Limits, ReadContext, WriteContext, get_format
 from app.formats.lif import WriteOptions

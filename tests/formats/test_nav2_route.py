@@ -13,7 +13,7 @@ import pytest
 import shapely
 
 from app import formats
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import CannotConvert, MissingDatum, TooLarge, UnreadableFile
 from app.formats import Group, Limits, ReadContext, WriteContext, get_format
 from app.model.features import Features, features

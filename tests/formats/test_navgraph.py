@@ -16,7 +16,7 @@ import yaml
 
 from app import formats
 from app.bundle import Hints
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import BadUpload, MissingDatum, UnreadableFile
 from app.formats import Group, ReadContext, WriteContext, get_format
 from app.formats._yaml import Tagged, load

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from app import formats
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import Invalid, TooLarge, UnreadableFile
 from app.formats import Group, Limits, ReadContext, _lzf, get_format
 from app.formats._pcd import parse

@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from app import formats
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import TooLarge, UnreadableFile
 from app.formats import Group, Limits, ReadContext, get_format
 from app.formats._ply import parse

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from app import formats
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import Ambiguous, Invalid, MissingLayer, NotFound
 from app.formats import Group, ReadContext, WriteContext, _lzf, get_format
 from app.model.layers import Layers, PartKey

@@ -15,7 +15,7 @@ import yaml
 from app import formats
 from app.bundle import Hints, Known
 from app.bundle import read as read_bundle
-from app.convert import offline
+from app.convert.files import offline
 from app.errors import BadUpload, Invalid, UnreadableFile
 from app.formats import Group, Limits, ReadContext, WriteContext, get_format
 from app.model.features import Features, features

@@ -21,7 +21,8 @@ import yaml
 
 from app import formats
 from app.bundle import Hints, unpack
-from app.convert import make, offline
+from app.convert import make
+from app.convert.files import offline
 from app.convert.recipe import Chain
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, Format, Limits, Needs, WriteContext

@@ -16,7 +16,7 @@ import pytest
 import shapely
 
 from app import formats, generate
-from app.convert import written
+from app.convert.files import written
 from app.derive import Notes
 from app.derive.objects_to_occupancy import Parameters, objects_to_occupancy
 from app.formats import Group, ReadContext

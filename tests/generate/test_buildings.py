@@ -9,7 +9,7 @@ import pytest
 import shapely
 import yaml
 
-from app.convert import written
+from app.convert.files import written
 from app.errors import CannotGenerate, Invalid
 from app.formats import Group, ReadContext, get_format, read
 from app.model.features import features

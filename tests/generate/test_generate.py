@@ -20,7 +20,7 @@ from app.model.features import Features
 from app.model.frame import GROUND, Datum
 from app.model.layers import Layers, PartKey
 from app.parameters import parameter
-from app.store import Store
+from app.store.store import Store
 
 POSTS = PartKey("objects", GROUND, "site")
 FENCE = PartKey("location", GROUND, "site")

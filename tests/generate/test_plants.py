@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import shapely
 
-from app.convert import written
+from app.convert.files import written
 from app.errors import CannotGenerate, Invalid
 from app.model.features import features
 from app.model.frame import GROUND, Datum

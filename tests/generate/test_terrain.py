@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from app.cli import run
-from app.convert import written
+from app.convert.files import written
 from app.errors import CannotGenerate, Invalid
 from app.generate import Source, _kernels_noise, _noise
 from app.model import solids

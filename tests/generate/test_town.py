@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 
-from app.convert import written
+from app.convert.files import written
 from app.errors import CannotGenerate, Invalid
 from app.generate import Source, _blocks, _streets
 from app.model.features import features

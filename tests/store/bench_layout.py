@@ -18,8 +18,8 @@ import shapely
 from app.model.features import Features, from_columns, points
 from app.model.frame import Datum
 from app.model.layers import PartKey
-from app.store import Store
 from app.store.changes import Changes, Operation, Put, Replace
+from app.store.store import Store
 
 BOX = (500.0, 500.0, 700.0, 700.0)
 KEY = PartKey("topology", "ground", "network")

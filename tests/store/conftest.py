@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from app.store import Store
+from app.store.store import Store
 from tests.postgres import postgres_cluster, postgres_url
 
 __all__ = ["postgres_cluster", "postgres_url"]

@@ -14,8 +14,8 @@ from app.model.grid import OccupancyGrid
 from app.model.imagery import Picture
 from app.model.layers import NETWORK, Layers, Part, PartKey, Resources
 from app.model.voxels import VoxelMap
-from app.store import Store
 from app.store.changes import Changes, Operation, Replace
+from app.store.store import Store
 from app.store.values import Provenance, Version
 
 DATUM = Datum(53.2, -0.5, 12.0, 10.0)

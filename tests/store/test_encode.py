@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from app.errors import Damaged, Invalid
 from app.model.features import features
-from app.store import Store, encode, parts
+from app.store import encode, parts
 from app.store.changes import Replace
+from app.store.store import Store
 from app.store.tree import Draft
 from tests.store.samples import TOPOLOGY, grid, mixed, network, picture, save, typed, voxels
 

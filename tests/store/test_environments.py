@@ -15,9 +15,9 @@ from app.events.messages import Event
 from app.model.features import features
 from app.model.frame import Datum
 from app.model.layers import PartKey
-from app.store import Store
 from app.store.changes import Delete, Put, Replace
 from app.store.extent import extent, geometry, join
+from app.store.store import Store
 from app.store.values import PartEntry, Provenance
 from tests.store.samples import DATUM, GRID, OBJECTS, TOPOLOGY, everything, grid, network, replaces, rows, save
 

@@ -17,9 +17,9 @@ import pytest
 from app.errors import Damaged, Invalid, NotFound, Unavailable
 from app.model.features import Features
 from app.model.layers import VECTOR_LAYERS, Layers
-from app.store import Store
 from app.store.changes import Changes, Replace
 from app.store.encode import compress, digest
+from app.store.store import Store
 from app.store.values import Source, Version
 from tests.store.samples import (
     DATUM,
@@ -37,7 +37,7 @@ CHILD = """
 import sys
 from pathlib import Path
 from app.model.layers import PartKey
-from app.store import Store
+from app.store.store import Store
 from app.store.changes import Changes, Replace
 from app.store.values import Source
 from tests.store.samples import TOPOLOGY, GRID, network, grid
@@ -230,7 +230,7 @@ def test_what_a_killed_upload_left_is_removed_at_the_start(store: Store):
     os.utime(stray, (old, old))
     (name,) = store.blobs.put_many([b"z" * 70_000])
     stop_here = (
-        "import sys, os; from pathlib import Path; from app.store import Store; import app.store.blobs as b\n"
+        "import sys, os; from pathlib import Path; from app.store.store import Store; import app.store.blobs as b\n"
         "b.os.fsync = lambda d: os.kill(os.getpid(), 9)\n"
         "Store(sys.argv[1], Path(sys.argv[2])).blobs.put_many([b'q' * 100_000])"
     )

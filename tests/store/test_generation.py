@@ -6,8 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from app.store import Store
 from app.store.generation import Generation
+from app.store.store import Store
 
 
 def test_it_changes_with_every_write_and_with_nothing_else(tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ import pytest
 
 from app.errors import Conflict, NotFound
 from app.model.closures import NO_CLOSURES
-from app.store import Store, overlays
+from app.store import overlays
+from app.store.store import Store
 from app.store.values import Overlay
 
 NOW = datetime.now(UTC).replace(microsecond=0)

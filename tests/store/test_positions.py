@@ -22,9 +22,10 @@ from app.model.frame import Datum
 from app.model.geodesy import local_frame, surface
 from app.model.grid import OccupancyGrid
 from app.model.layers import PartKey
-from app.store import Store, area, position, schema, tables
+from app.store import area, position, schema, tables
 from app.store.changes import Changes, Delete, Drop, Put, Replace
 from app.store.encode import to_wkb
+from app.store.store import Store
 from app.store.values import Match
 from tests.store.samples import DATUM, OBJECTS, TOPOLOGY, network, save
 

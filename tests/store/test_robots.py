@@ -11,8 +11,9 @@ import pytest
 
 from app.errors import Conflict, NotFound
 from app.fleet import holding, is_online, lag_of
-from app.store import Store, robots
+from app.store import robots
 from app.store.changes import Replace
+from app.store.store import Store
 from app.store.values import NO_ROOT, Heard, Held, Move, Report
 from tests.store.samples import DATUM, GRID, grid, save
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from app.fleet import decide
-from app.store import Store
 from app.store.changes import Replace
+from app.store.store import Store
 from app.store.values import Channel, Heard, Report, Robot, Rollout
 from tests.store.samples import GRID, grid, save
 

@@ -15,9 +15,9 @@ from alembic.script import ScriptDirectory
 
 from app.errors import Unavailable
 from app.main import alone
-from app.store import Store
 from app.store.database import Database
 from app.store.schema import comparison, config, newest
+from app.store.store import Store
 from app.store.tables import metadata
 from app.store.values import Heard, Report
 

@@ -10,9 +10,9 @@ import pytest
 from sqlalchemy import exc
 
 from app.errors import Damaged, DatabaseDamaged, NoRoom, Unavailable
-from app.store import Store
 from app.store.changes import Changes
 from app.store.scrub import LOCK, Scrub, figures, read_state
+from app.store.store import Store
 from app.store.values import Source
 from tests.store.samples import GRID, everything, grid, replaces, save
 

@@ -20,8 +20,8 @@ from app.model.frame import Datum, Level
 from app.model.layers import Layers, Part, PartKey, Resources
 from app.model.templates import NO_TEMPLATES, Own, Templates
 from app.model.voxels import VoxelMap
-from app.store import Store
 from app.store.changes import Changes, Delete, Drop, Put, Replace
+from app.store.store import Store
 from app.store.values import Idempotency, Provenance, Source
 from tests.store.samples import (
     DATUM,

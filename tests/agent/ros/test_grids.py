@@ -74,7 +74,7 @@ def test_as_the_server_writes_it(tmp_path: Path) -> None:
     """A grid that the server has read and written, against the server's own cells."""
     np = pytest.importorskip("numpy", reason="the server's packages")
     from app.bundle import Hints
-    from app.convert import offline
+    from app.convert.files import offline
     from tests.api import samples
 
     made = offline(samples.grid(), "occupancy_grid", hints=Hints())
