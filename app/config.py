@@ -89,10 +89,12 @@ class Settings(BaseSettings):
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info",
-        description="How much is logged. `warning`: refused tokens and failures; `info`: also changes and what takes "
-        "over a second; `debug`: every request but those answered from memory.",
+        description="Lowest level that is logged. `warning`: refused tokens and failures; `info`: also changes and "
+        "requests that take over a second; `debug`: all requests except those answered from memory.",
     )
-    log_format: LogFormat = Field(default="text", description="`text`: lines for people; `json`: an object in a line.")
+    log_format: LogFormat = Field(
+        default="text", description="`text`: lines for people; `json`: one JSON object per line."
+    )
 
     conversion_workers: int = Field(
         default_factory=lambda: max(1, min(8, os.cpu_count() or 1)),
@@ -126,10 +128,13 @@ class Settings(BaseSettings):
         default=168.0,
         ge=0,
         le=8760,
-        description="How often everything stored is hashed again in the background, to find damage early; 0: never.",
+        description="Hours between background checks of all stored data against its hashes, to find damage early; "
+        "0: never.",
     )
     scrub_bytes_per_second: int = Field(
-        default=4 * 2**20, ge=1024, description="How fast that goes, so that it disturbs nobody."
+        default=4 * 2**20,
+        ge=1024,
+        description="Maximum read speed of these checks, so that they slow down no request.",
     )
 
     max_uploads: int = Field(
@@ -312,8 +317,8 @@ class Settings(BaseSettings):
     max_unpacked_ratio: int = Field(
         default=_DEFAULTS.unpacked_ratio,
         ge=1,
-        description="Most bytes that one byte of a compressed file may unfold to, on average. Does not count up to 16 "
-        "MiB, for pictures up to one byte for each of `max_pixels`.",
+        description="Maximum bytes that a compressed file unpacks to, per compressed byte; half of it for a text in an "
+        "archive. 16 MiB are always allowed, for images as many bytes as `max_pixels`.",
     )
     max_files: int = Field(default=_DEFAULTS.files, ge=1, description="Most files in one upload or archive.")
     max_pixels: int = Field(default=_DEFAULTS.pixels, ge=1, description="Most pixels or cells of one picture or grid.")

@@ -108,7 +108,7 @@ Create = Annotated[
     typer.Option(
         "--create/--no-create",
         help="Create an environment that does not exist, or refuse to "
-        "[default: create, unless the name looks like a slip in that of an existing one].",
+        "[default: create, unless the name looks like a misspelling of an existing one].",
         show_default=False,
     ),
 ]

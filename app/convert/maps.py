@@ -174,7 +174,7 @@ class Maps:
             with contextlib.suppress(LostMap), self.cache.holding() as hold:
                 held = [self._held(member.recipe, hold, stop) for member in recipe.members]
                 return self.cache.get_or_make(recipe.key, partial(joined, recipe, held))
-        raise Unavailable("the cache of maps is damaged again and again: its disk may be failing")
+        raise Unavailable("cached maps are damaged repeatedly: check the disk of the cache")
 
     def _held(self, recipe: Recipe, hold: Callable[[Made], Made], stop: Stop | None) -> Made:
         for _ in range(HOLD_ATTEMPTS):

@@ -173,7 +173,7 @@ def _without_unseen(grid: OccupancyGrid, parameters: Parameters, notes: Notes, c
         notes.warn(f"{count}free_thresh of {grid.free_thresh:g} calls free: ways may lead where nobody has been; {fix}")
         return grid
     notes.warn(
-        f"{count}free_thresh of {grid.free_thresh:g} calls free: no ways lead there; unknown_grey=free takes them as "
+        f"{count}free_thresh of {grid.free_thresh:g} calls free: no edges lead there; unknown_grey=free takes them as "
         f"free; {fix}"
     )
     return replace(grid, cells=np.where(grey, np.uint8(UNKNOWN), grid.cells))

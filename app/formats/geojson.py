@@ -194,7 +194,7 @@ class _Reader:
         if said is not None and not self.local:
             text = said if isinstance(said, str) else orjson.dumps(said).decode()
             if not _EARTH.match(text):
-                reason = f"{text[:80]} is not known here: only geometry (WGS 84) counts, a place is left out"
+                reason = f"{text[:80]} is unsupported: only `geometry` (WGS 84) is read, `place` is ignored"
                 self.context.warn(reason, where="coordRefSys")
         box = self.top.get("bbox")
         if box is not None and not _is_box(box):

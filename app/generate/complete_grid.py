@@ -44,8 +44,8 @@ class Options:
     )
     confidence: float = parameter(
         0.98,
-        "share of right cells, as holes cut into the known part show it, that free cells need: others stay unknown; 0: "
-        "all cells within reach are made up, as free or occupied",
+        "minimum share of cells with the same surroundings that were free in holes cut into the known part; other "
+        "cells stay unknown; 0: all cells within reach are filled in, as free or occupied",
         minimum=0.0,
         maximum=0.9999,
     )
@@ -107,7 +107,7 @@ def _completed(grid: OccupancyGrid, options: Options, source: Source, notes: Not
         wanted = np.zeros_like(wanted)
         wanted[tuple(at[share[kind] >= options.confidence].T)] = True
         if not wanted.any() and not wall.any():
-            reason = f"{name}: no unknown cell is that sure: give a lower confidence, or a smaller reach"
+            reason = f"{name}: no unknown cell reaches this confidence: set a lower confidence, or a smaller reach"
             raise refused("confidence", reason)
     if wanted.any():
         _fill(cells, occupied, known, wanted, counts, options, source, notes, key)

@@ -177,7 +177,7 @@ class Database:
         except exc.DataError as error:
             if "NUL" not in _short(error):
                 raise
-            raise Invalid("a name or text has a NUL character: nothing here has one") from error
+            raise Invalid("a name or text has a NUL character: remove it") from error
         except (exc.DBAPIError, exc.TimeoutError) as error:
             ours = self._error(error)
             if ours is None:
