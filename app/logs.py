@@ -48,7 +48,9 @@ class TextFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """One line, whatever the message has in it; a trace below it."""
         head = f"{_time(record)} {record.levelname:<7} {REQUEST_ID.get() or '-'} {record.name}: "
-        text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in record.getMessage())
+        text = record.getMessage()
+        if not text.isprintable():
+            text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
         return head + text + (f"\n{self.formatException(record.exc_info)}" if record.exc_info else "")
 
 

@@ -54,4 +54,5 @@ def as_dict(entry: AuditEntry) -> dict[str, object]:
         "method": entry.method,
         "path": entry.path,
         "environment": entry.environment,
+        "target": entry.target,
     }

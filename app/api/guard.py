@@ -18,7 +18,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.api import problems
-from app.api.access import Principal, environment_of, is_open
+from app.api.access import MAX_SOURCES, Principal, environment_of, is_open, source_of
 from app.api.answers import API
 from app.api.problems import MalformedBody, SlowBody, UnsupportedMedia
 from app.api.protocol import PROVE
@@ -41,8 +41,14 @@ _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
 _REQUEST_ID = re.compile(rb"[A-Za-z0-9._-]{1,64}")
-_REPORT = re.compile(r"/api/v1/robots/[^/]+/status")
+_REPORT = re.compile(r"/api/v1/robots/[^/]+/(?:status|vda5050/state)")
 """A robot's report: no change of a map or of who may do what, and too frequent for the audit log."""
+
+MAX_LOGGED_PATH = 300
+"""Characters of an address that a log line has."""
+
+LOGGED_REFUSALS = 20
+"""Refusals of one source a minute that are logged; further ones with level debug."""
 
 SLOW_SECONDS = 1.0
 """A request that takes longer is logged like a change."""
@@ -161,10 +167,29 @@ def _address(scope: Scope) -> str:
     return str(client[0]) if client else "-"
 
 
+class _Quota:
+    """How many refusals of one source a minute are worth a warning: strangers must not fill the log."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, int] = {}
+        self._minute = 0
+
+    def allow(self, source: str) -> bool:
+        """Count one, and tell whether it is among the first of this minute."""
+        minute = int(time.monotonic() // 60)
+        if minute != self._minute or len(self._counts) > MAX_SOURCES:
+            self._counts, self._minute = {}, minute
+        self._counts[source] = self._counts.get(source, 0) + 1
+        return self._counts[source] <= LOGGED_REFUSALS
+
+
+_refusals = _Quota()
+
+
 def _log(scope: Scope, status: int, seconds: float, reason: str) -> None:
     """A request: refusals and failures always, changes and slow ones from level info on, the others with debug."""
     changes = scope["method"] not in ("GET", "OPTIONS") and not _REPORT.fullmatch(scope["path"])
-    if status >= 500 or status in (401, 403, 429):
+    if status >= 500 or (status in (401, 403, 429) and _refusals.allow(source_of(_address(scope)))):
         level = logging.WARNING
     elif changes or seconds > SLOW_SECONDS:
         level = logging.INFO
@@ -175,7 +200,7 @@ def _log(scope: Scope, status: int, seconds: float, reason: str) -> None:
     who = scope["state"].get("principal")
     fields = {
         "method": scope["method"],
-        "path": scope["path"],
+        "path": scope["path"][:MAX_LOGGED_PATH],
         "status": status,
         "ms": round(seconds * 1000, 1),
         "token": who.name if who else "",

@@ -18,6 +18,7 @@ from app.api.services import Here, Services
 from app.api.signed import Grant
 from app.convert.cache import MadeFile
 from app.convert.maps import file_of
+from app.store.audit import about
 from app.store.values import Version, rfc3339
 
 router = APIRouter(prefix="/environments/{env}/versions/{v}", tags=["maps"], route_class=Route)
@@ -47,6 +48,8 @@ async def create_link(
     linked = await link_to(here, request, who, version, body.format, body.file, values, body.seconds)
     if isinstance(linked, Started):
         return started(linked.job)
+    about(target=f"link to {body.format} of version {version.number}, until {linked.expires}")
+    await run_in_threadpool(here.store.record_change)
     out = {
         "url": linked.url,
         "expires": linked.expires,

@@ -61,10 +61,12 @@ def rotate_key(here: Here, _: ServerAdmin) -> Response:
 
     Signed links get a new secret as well; links that were made before stay valid until they expire.
     """
-    made = here.keys.rotate()
-    here.links.rotate()
-    here.store.record_change()
-    here.store.generation.change()  # what was signed with the old key is in memory no longer
+    try:
+        with here.store.changing():
+            made = here.keys.rotate()
+            here.links.rotate()
+    finally:
+        here.store.generation.change()  # what was signed with the old key is in memory no longer
     return answer(made.as_dict(), 201)
 
 

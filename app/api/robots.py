@@ -17,6 +17,7 @@ from app.api.answers import Route, answer, page
 from app.api.schemas import CHANNEL, NAME, Cursor, Limit, RobotDetailOut, RobotOut, RobotPath, StatusBody, told
 from app.api.services import Here, Services
 from app.errors import Denied, Invalid, NotFound, Problem
+from app.store.audit import about
 from app.store.values import Channel, Heard, Held, Move, Report, Robot, rfc3339
 
 router = APIRouter(prefix="/robots", tags=["robots"], route_class=Route)
@@ -111,6 +112,7 @@ def forget_robot(
 ) -> Response:
     """It no longer counts among its channel's robots. It comes back with its next report."""
     who.enter(environment)
+    about(environment=environment)
     here.store.forget_robot(environment, robot)
     return Response(status_code=204)
 

@@ -934,7 +934,8 @@ class AuditTokenOut(BaseModel):
 
 
 class AuditOut(BaseModel):
-    """One change. request: the `X-Request-Id` of its answer, which the server's log names as well."""
+    """One change. request: the `X-Request-Id` of its answer, which the server's log has, too. target: what was made,
+    where the path does not name it."""
 
     id: int
     time: datetime
@@ -944,6 +945,7 @@ class AuditOut(BaseModel):
     method: str
     path: str
     environment: str | None
+    target: str | None
 
 
 class NewTokenOut(TokenOut):

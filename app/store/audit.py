@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import datetime
@@ -18,7 +20,8 @@ MAX_PATH = 1000
 
 @dataclass(slots=True)
 class Caller:
-    """A request that changes something, and who sent it. recorded: whether its row is committed."""
+    """A request that changes something, and who sent it. target: what it makes, where the path does not name it.
+    recorded: whether its row is committed."""
 
     token_id: str
     token: str
@@ -28,6 +31,7 @@ class Caller:
     method: str
     path: str
     environment: str | None
+    target: str | None = None
     recorded: bool = False
 
 
@@ -49,6 +53,22 @@ class AuditEntry:
     method: str
     path: str
     environment: str | None
+    target: str | None
+
+
+def about(*, environment: str | None = None, target: str | None = None) -> None:
+    """Say what the current request changes, where its path does not."""
+    caller = CALLER.get()
+    if caller is not None:
+        caller.environment = environment or caller.environment
+        caller.target = target or caller.target
+
+
+def changes_nothing() -> None:
+    """Say that the current request is an earlier one that was sent again: it gets no entry of its own."""
+    caller = CALLER.get()
+    if caller is not None:
+        caller.recorded = True
 
 
 def record(connection: Connection) -> Caller | None:
@@ -66,6 +86,7 @@ def record(connection: Connection) -> Caller | None:
         "method": caller.method,
         "path": caller.path[:MAX_PATH],
         "environment": caller.environment,
+        "target": caller.target,
     }
     connection.execute(insert(tables.audit).values(**values))
     return caller
@@ -75,9 +96,15 @@ class Audit(Base):
     """Reading the audit log."""
 
     def record_change(self) -> None:
-        """Record the current request's change of something that is not in the database (the server's key)."""
+        """Record the current request, which gives somebody access and changes nothing that is stored."""
         with self._database.write():
             pass
+
+    @contextmanager
+    def changing(self) -> Iterator[None]:
+        """Record the current request's change of something that is not in the database (the server's key)."""
+        with self._database.write():
+            yield
 
     def audit(
         self,
@@ -112,4 +139,5 @@ def _as_entry(row: Row[Any]) -> AuditEntry:
         row.method,
         row.path,
         row.environment,
+        row.target,
     )

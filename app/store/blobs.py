@@ -140,7 +140,7 @@ class Blobs:
                 self._write_large(workspace, {n: d for n, d in large.items() if n in lost})
                 rows = self._write_packs(workspace, {n: d for n, d in small.items() if n in lost})
             rows += [{"sha256": n, "size": sizes[n], "pack": None, "start": 0} for n in large if n in lost]
-            with self._database.write() as connection:
+            with self._database.write(upkeep=True) as connection:
                 _upsert(connection, [r for r in rows if r["sha256"] not in known])
                 # A row whose file was lost: the content is back, at a new place.
                 _relocate(
@@ -156,7 +156,7 @@ class Blobs:
         with self._database.read() as connection:
             if not self._rows(connection, names):
                 return out
-        with self._database.write() as connection:
+        with self._database.write(upkeep=True) as connection:
             for start in range(0, len(names), BATCH):
                 some = names[start : start + BATCH]
                 connection.execute(update(blob).where(blob.c.sha256.in_(some)).values(used=int(time.time())))
@@ -364,7 +364,7 @@ class Blobs:
         packs: set[str] = set()
         for start in range(0, len(names), BATCH):
             some = names[start : start + BATCH]
-            with self._database.write() as connection:
+            with self._database.write(upkeep=True) as connection:
                 gone = connection.execute(
                     delete(blob)
                     .where(blob.c.sha256.in_(some), blob.c.used < before)
@@ -389,12 +389,12 @@ class Blobs:
         if names:
             with self._workspace() as workspace:
                 moved = self._write_pack(workspace, self.get_many(names))
-            with self._database.write() as connection:
+            with self._database.write(upkeep=True) as connection:
                 _relocate(
                     connection,
                     [{"name": r["sha256"], "to": r["pack"], "at": r["start"], "pack_was": pack} for r in moved],
                 )
-        with self._database.write() as connection:
+        with self._database.write(upkeep=True) as connection:
             if connection.execute(select(blob.c.sha256).where(blob.c.pack == pack).limit(1)).first() is None:
                 (self._packs / pack).unlink(missing_ok=True)
 

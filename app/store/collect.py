@@ -76,7 +76,7 @@ class Collection(Base):
                 rows = connection.execute(query.limit(PAGE * 10)).all()
             idle = [bytes(h) for h, used in rows if used < before and bytes(h) not in live]
             if idle:
-                with self._database.write() as connection:
+                with self._database.write(upkeep=True) as connection:
                     count += chunks.delete(connection, idle, before)
             if len(rows) < PAGE * 10:
                 return count
@@ -85,7 +85,7 @@ class Collection(Base):
     def _tidy(self) -> None:
         now = utcnow()
         known, keys, jobs = tables.event, tables.idempotency, tables.job
-        with self._database.write() as connection:
+        with self._database.write(upkeep=True) as connection:
             connection.execute(delete(keys).where(keys.c.time < now - timedelta(days=IDEMPOTENCY_DAYS)))
             silent = now - timedelta(days=ROBOT_DAYS)
             for table in (tables.robot, tables.robot_history, tables.presence):

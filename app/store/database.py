@@ -153,13 +153,15 @@ class Database:
             yield connection
 
     @contextmanager
-    def write(self, *, tell: bool = True) -> Iterator[Connection]:
-        """A transaction that writes: all or nothing, and on disk when it ends. tell: whether caches are to know."""
+    def write(self, *, tell: bool = True, upkeep: bool = False) -> Iterator[Connection]:
+        """A transaction that writes: all or nothing, and on disk when it ends. tell: whether caches are to know.
+        upkeep: it is no change that anybody asked for, so that the audit log has nothing of it.
+        """
         with self._in_turn(), self.connected() as connection:
             connection.execution_options(write=True)
             with connection.begin():
                 yield connection
-                caller = self._record(connection)
+                caller = None if upkeep else self._record(connection)
         if caller is not None:
             caller.recorded = True
         if tell:

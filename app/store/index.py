@@ -127,7 +127,7 @@ class SpatialIndex(Base):
 
     def _refresh(self, environment_id: str) -> None:
         table = tables.environment
-        with self._database.write() as connection:
+        with self._database.write(upkeep=True) as connection:
             row = connection.execute(select(table).where(table.c.id == environment_id).with_for_update()).one_or_none()
             if row is None or row.indexed == row.head:
                 return
@@ -152,7 +152,7 @@ class SpatialIndex(Base):
 
     def rebuild_index(self) -> None:
         """Throw the index away and make it anew from the trees."""
-        with self._database.write() as connection:
+        with self._database.write(upkeep=True) as connection:
             connection.execute(delete(tables.place))
             connection.execute(update(tables.environment).values(indexed=-1))
         self.refresh_index()

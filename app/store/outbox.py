@@ -126,7 +126,7 @@ class Outbox(Base):
     def set_relayed(self, position: int) -> None:
         """Note that events up to this position were handed over. It never goes back."""
         table = tables.relay
-        with self._database.write(tell=False) as connection:
+        with self._database.write(tell=False, upkeep=True) as connection:
             known = connection.execute(select(table.c.position).where(table.c.id == 1)).scalar()
             if known is None:
                 connection.execute(insert(table).values(id=1, position=position))

@@ -154,7 +154,7 @@ class Overlays(Base):
         with self._database.read() as connection:
             due = connection.execute(query).all()
         for found in due:
-            with suppress(NotFound), self._database.write() as connection:
+            with suppress(NotFound), self._database.write(upkeep=True) as connection:
                 row = environment_row(connection, found.environment, lock=True)
                 stored = _read(connection, row, found.id)
                 if stored.state != found.state or stored.expires > now:

@@ -37,7 +37,7 @@ class Robots(Base):
         such environment, Conflict where it has too many robots already.
         """
         out: list[FleetMapError | None] = [None] * len(heard)
-        with self._database.write(tell=False) as connection:
+        with self._database.write(tell=False, upkeep=True) as connection:
             owners: dict[str, str | FleetMapError] = {}
             # One order for all writers, so that none waits for another that waits for it; each robot's own order stays.
             for k in sorted(range(len(heard)), key=lambda k: (heard[k].environment, heard[k].robot)):
@@ -126,7 +126,7 @@ class Robots(Base):
     def note_presence(self, there: Collection[str], gone: Collection[str], now: datetime) -> None:
         """Robots that are on the bus at this moment, and robots that have left it."""
         table = tables.presence
-        with self._database.write(tell=False) as connection:
+        with self._database.write(tell=False, upkeep=True) as connection:
             room = MAX_PRESENT - int(connection.execute(select(func.count()).select_from(table)).scalar_one())
             make = sqlite.insert if connection.dialect.name == "sqlite" else postgresql.insert
             rows = sorted([(name, True) for name in there] + [(name, False) for name in gone])

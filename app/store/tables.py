@@ -456,6 +456,7 @@ audit = Table(
     Column("method", String(16), nullable=False),
     Column("path", Text, nullable=False),
     Column("environment", String(63), nullable=True),
+    Column("target", Text, nullable=True),
     Index("ix_audit_environment", "environment", "id"),
 )
 """Who changed what, from where. Rows outlive tokens and environments, so they hold their names."""

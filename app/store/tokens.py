@@ -14,6 +14,7 @@ from sqlalchemy.exc import IntegrityError
 
 from app.errors import Conflict, Invalid, NotFound, Unavailable
 from app.store import tables
+from app.store.audit import about
 from app.store.base import Base, text, utcnow
 from app.store.values import Role, Token, rfc3339
 
@@ -57,6 +58,7 @@ class Tokens(Base):
             "expires": expires,
             "created": utcnow(),
         }
+        about(target=f"token {values['id']}")
         try:
             with self._database.write() as connection:
                 connection.execute(insert(tables.token).values(hash=_hash(secret), **values))
@@ -118,7 +120,7 @@ class Tokens(Base):
         with self._database.read() as connection:
             if connection.execute(select(table.c.id).where(expired).limit(1)).first() is None:
                 return 0
-        with self._database.write() as connection:
+        with self._database.write(upkeep=True) as connection:
             count = int(connection.execute(update(table).where(expired).values(ended=now)).rowcount)
         log.info("tokens: expired (count=%d, time=%s)", count, rfc3339(now))
         return count

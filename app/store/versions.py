@@ -14,6 +14,7 @@ from app.model.frame import Datum, Level
 from app.model.templates import Templates, template_changes
 from app.store import chunks, index, outbox, parts, tables
 from app.store.area import area_after, put_area
+from app.store.audit import changes_nothing
 from app.store.base import Base, clean, clean_problem, environment_row, nearest_channel, text, utcnow
 from app.store.changes import KEEP, Changes, Keep, Prepared
 from app.store.extent import extent, geometry
@@ -209,6 +210,7 @@ class Versions(Base):
             row = environment_row(connection, environment, lock=True)
             known = _replayed(connection, row, idempotency)
             if known is not None:
+                changes_nothing()
                 return read_version(connection, row, known)
             _check_head(row, prepared.base)
             now = utcnow()

@@ -30,6 +30,7 @@ def upgrade() -> None:
         sa.Column("method", sa.String(16), nullable=False),
         sa.Column("path", sa.Text, nullable=False),
         sa.Column("environment", sa.String(63), nullable=True),
+        sa.Column("target", sa.Text, nullable=True),
     )
     op.create_index("ix_audit_environment", "audit", ["environment", "id"])
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from app.api.guard import LOGGED_REFUSALS
 from app.logs import REQUEST_ID, JsonFormatter, TextFormatter
 from app.store.audit import CALLER, Caller
 from app.store.store import Store
@@ -31,17 +32,23 @@ def test_each_change_has_one_entry(api: Api) -> None:
     before = newest(api, environment="audited")
     assert [(e["method"], e["path"], e["token"]["name"], e["token"]["role"]) for e in before] == [
         ("POST", "/api/v1/environments/audited/versions", "a-editor", "editor"),
+        ("POST", "/api/v1/environments", "administrator", "admin"),
     ]
     assert before[0]["request"] == answer.headers["x-request-id"]
     assert before[0]["address"] == "127.0.0.1"
-    made = newest(api, limit=2)[1]
-    assert (made["path"], made["request"]) == ("/api/v1/environments", "deploy-7")
+    assert (before[1]["target"], before[1]["request"]) == ("environment audited", "deploy-7")
 
     api.get("environments/audited")
     editor.upload("audited", {"a.kml": b"<kml>"}, expect=422)
     editor("PATCH", "environments/audited", 403, json={"title": "no"})
     api.post("convert", expect=415)
-    assert newest(api, limit=1) == newest(api, environment="audited", limit=1) == before
+    assert newest(api, environment="audited") == before
+    assert newest(api, limit=1) == before[:1]
+
+    again = {"Idempotency-Key": "once"}
+    for _ in range(2):
+        editor.upload("audited", {"b.kml": samples.KML.replace(b"</Document>", b" </Document>")}, None, headers=again)
+    assert len(newest(api, environment="audited")) == 3
 
     api.post("keys")
     assert newest(api, limit=1)[0]["path"] == "/api/v1/keys"
@@ -104,6 +111,16 @@ def test_log_names_changes_and_refused_tokens_but_no_token(api: Api, caplog: pyt
     line = TextFormatter().format(records[1])
     assert line.count("\n") == 0
     assert "a\\nb" in line
+
+
+def test_log_is_not_filled_by_strangers(api: Api, caplog: pytest.LogCaptureFixture) -> None:
+    nobody = api.as_(None)
+    with caplog.at_level(logging.INFO, logger="app.requests"):
+        for _ in range(LOGGED_REFUSALS + 10):
+            nobody("GET", "environments/" + "x" * 3000)
+    lines = [r.getMessage() for r in caplog.records if r.name == "app.requests"]
+    assert len(lines) <= LOGGED_REFUSALS
+    assert all(len(line) < 600 for line in lines)
 
 
 def test_log_as_json_has_the_fields_of_a_request() -> None:
