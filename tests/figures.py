@@ -444,15 +444,15 @@ def kill_during_uploads(folder: Path, times: int) -> Outcome:
 
 
 FAULTS: dict[str, tuple[Callable[[Path, int], Outcome], int]] = {
-    "kill -9 of the server, robots follow (PostgreSQL)": (partial(kill, "server"), 10),
-    "kill -9 of the server while uploads arrive (SQLite)": (kill_during_uploads, 10),
-    "kill -9 of the router": (partial(kill, "router"), 10),
-    "kill -9 of PostgreSQL": (partial(kill, "database"), 10),
-    "full disk": (full_disk, 5),
-    "flipped byte in a cached map": (partial(damage, partial(flip_file, cached), lambda site: None), 5),
-    "flipped byte in a stored upload": (partial(damage, partial(flip_file, blobs), Site.repair), 5),
-    "flipped byte in a chunk of a version": (partial(damage, flip_chunk, Site.repair), 5),
-    "flipped byte in a database page (SQLite)": (partial(damage, flip_page, Site.restore), 5),
+    "kill -9 of the server, robots follow (PostgreSQL)": (partial(kill, "server"), 5),
+    "kill -9 of the server while uploads arrive (SQLite)": (kill_during_uploads, 5),
+    "kill -9 of the router": (partial(kill, "router"), 5),
+    "kill -9 of PostgreSQL": (partial(kill, "database"), 5),
+    "full disk": (full_disk, 3),
+    "flipped byte in a cached map": (partial(damage, partial(flip_file, cached), lambda site: None), 3),
+    "flipped byte in a stored upload": (partial(damage, partial(flip_file, blobs), Site.repair), 3),
+    "flipped byte in a chunk of a version": (partial(damage, flip_chunk, Site.repair), 3),
+    "flipped byte in a database page (SQLite)": (partial(damage, flip_page, Site.restore), 3),
     f"{SLOW} connections at a byte now and then": (slow_connections, 1),
     "clock a year ahead, a year behind": (wrong_clock, 3),
 }
