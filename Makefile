@@ -16,7 +16,7 @@ SYNC := UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen 
 ROBOT := app/__init__.py app/errors.py app/event_types.py app/events/__init__.py app/events/login.py \
   app/events/messages.py app/model/__init__.py app/model/frame.py app/model/names.py app/signing.py app/agent app/cli
 
-.PHONY: run test lint bench chaos fuzz install install-dev clean
+.PHONY: run test lint bench chaos fuzz figures install install-dev clean
 
 run: install
 	@$(BIN)/fleetmap serve --demo $(ARGS)
@@ -43,6 +43,11 @@ chaos: install-dev
 # Mutations of every sample through the read boundary, for some minutes: ARGS="--minutes 30 --seed 7 --format kml".
 fuzz: install-dev
 	@$(BIN)/python -m tests.hostile.fuzz $(ARGS)
+
+# The two tables of docs/security.md: hostile input and faults.
+figures: install-dev
+	@$(BIN)/python -m tests.figures hostile $(ARGS)
+	@$(BIN)/python -m tests.figures faults $(ARGS)
 
 install: $(VENV)/.installed
 

@@ -233,7 +233,8 @@ class Bus:
     def tend(self) -> bool:
         """Look after it: a dead router of ours is started again; the session finds it by itself."""
         router = self._router
-        if self._session is None or (router is not None and not router.alive):
+        is_missing = self.options.mode == "router" and (router is None or not router.alive)
+        if self._session is None or is_missing:
             return self.open() and self.connected
         if self.connected:
             return True

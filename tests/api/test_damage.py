@@ -190,8 +190,13 @@ def test_a_missing_or_replaced_database_file_takes_no_writes(tmp_path: Path) -> 
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
+    with mounted_disk(tmp_path / "disk") as folder:
+        yield folder
+
+
+@contextlib.contextmanager
+def mounted_disk(folder: Path) -> Iterator[Path]:
     """A disk of 12 MB."""
-    folder = tmp_path / "disk"
     folder.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", "size=12m,mode=700", "tmpfs", str(folder)]
     if os.geteuid() != 0 or subprocess.run(command, check=False, capture_output=True).returncode != 0:
@@ -205,12 +210,10 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def fill(folder: Path) -> Path:
     """Use up a disk to its last byte."""
     ballast = folder / "ballast"
-    with contextlib.suppress(OSError), ballast.open("wb", buffering=0) as file:
-        while True:
-            file.write(bytes(4096))
-    with contextlib.suppress(OSError), (folder / "ballast2").open("wb", buffering=0) as file:
-        while True:
-            file.write(b"x")
+    for block in (bytes(4096), b"x"):
+        with contextlib.suppress(OSError), ballast.open("ab", buffering=0) as file:
+            while True:
+                file.write(block)
     return ballast
 
 
@@ -249,7 +252,6 @@ def test_a_full_disk_stops_writes_alone(small_disk: Path) -> None:
             problem(api("GET", "/readyz?for=writes", 503))
             if started_full:
                 ballast.unlink()
-                (small_disk / "ballast2").unlink()
                 api.upload(farm, {NETWORK: samples.tmap2().replace(b"0.1", b"0.3")}, 201)
                 api.get(f"/maps/{farm}/kml")
                 ready = api.get("/readyz?for=writes").json()

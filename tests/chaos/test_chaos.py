@@ -43,13 +43,14 @@ def test_sqlite_and_a_separate_router(tmp_path: Path) -> None:
         check(fleet)
 
 
-def havoc(fleet: Fleet, each: dict[str, int]) -> None:
-    """Kill each so many times, in a random order, aimed at each phase in turn."""
+def havoc(fleet: Fleet, each: dict[str, int]) -> list[float]:
+    """Kill each so many times, in a random order, aimed at each phase in turn: seconds until /healthz after each."""
     world, dice = fleet.world, random.Random(SEED)
     order = [target for target, count in each.items() for _ in range(count)]
     dice.shuffle(order)
     aims = {target: [COMMIT, RELAY, DOWNLOAD, ANY] for target in each}
     met: Counter[tuple[str, str]] = Counter()
+    healthy: list[float] = []
     for target in order:
         aim = aims[target].pop(0)
         aims[target].append(aim)
@@ -57,7 +58,7 @@ def havoc(fleet: Fleet, each: dict[str, int]) -> None:
         met.update((target, phase) for phase in fleet.under_way())
         getattr(world, f"kill_{target}")()
         time.sleep(dice.choice((0.0, 0.0, 0.1, 0.5)))
-        getattr(world, f"revive_{target}")()
+        healthy.append(world.revive(target))
         before = fleet.made()
         if dice.random() < 0.7:  # else the next one comes while it is still coming up
             eventually(lambda n=before: fleet.made() > n, 60)
@@ -67,6 +68,7 @@ def havoc(fleet: Fleet, each: dict[str, int]) -> None:
     print(f"killed {dict(Counter(order))}; under way then: { {f'{t} {p}': n for (t, p), n in sorted(met.items())} }")
     for phase in (COMMIT, RELAY, DOWNLOAD) if len(order) >= 10 else ():
         assert any(count for (_, p), count in met.items() if p == phase), f"no kill came in the middle of a {phase}"
+    return healthy
 
 
 def check(fleet: Fleet) -> None:
@@ -99,12 +101,16 @@ def check_versions(fleet: Fleet, head: int) -> None:
     assert [v["version"] for v in versions] == list(range(head, -1, -1)), "a gap, a fork or a number used twice"
     assert [v["parent"] for v in versions] == [*range(head - 1, -1, -1), None]
     told = {v["version"]: v["message"] for v in versions}
-    for writer in (*fleet.first, *fleet.writers):
-        assert writer.made
-        for message, number in writer.made.items():
-            assert told[number] == message
+    assert all(writer.made for writer in (*fleet.first, *fleet.writers))
+    assert lost_versions(fleet, told) == []
     counts = Counter(told.values())
     assert all(counts[message] == 1 for writer in fleet.writers for message in writer.made), "a commit was made twice"
+
+
+def lost_versions(fleet: Fleet, messages: dict[int, str]) -> list[int]:
+    """The acknowledged versions that are absent or another commit, by the messages that the server lists."""
+    made = [item for writer in (*fleet.first, *fleet.writers) for item in writer.made.items()]
+    return [number for message, number in made if messages.get(number) != message]
 
 
 def _after(versions: list[dict[str, object]]) -> str:

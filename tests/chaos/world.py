@@ -12,6 +12,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from app.events.router import Router
 from app.store.store import Store
 from tests.agent.conftest import ROOT, Robot, network
 from tests.api.conftest import ADMIN
-from tests.cli.conftest import ServerProcess
+from tests.cli.conftest import ServerProcess, seconds_until_healthy
 from tests.events.conftest import Listener, client_config, eventually, free_port
 from tests.postgres import Cluster
 
@@ -73,6 +74,14 @@ class World:
         arguments = ("--port", str(self.port), "--data-dir", str(self.folder / "data"))
         self.server = ServerProcess(*arguments, environment=self.variables, folder=ROOT)
         self.server.ready()
+
+    def revive(self, target: str) -> float:
+        """Bring back what was killed; the seconds until /healthz answers."""
+        start = time.monotonic()
+        with ThreadPoolExecutor(1) as pool:
+            healthy = pool.submit(seconds_until_healthy, f"http://127.0.0.1:{self.port}", start)
+            getattr(self, f"revive_{target}")()
+            return healthy.result()
 
     def kill_server(self) -> None:
         assert self.server is not None

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from app.cli import run
@@ -105,6 +106,10 @@ class ServerProcess:
             else:
                 return address
 
+    def seconds_until_healthy(self, start: float) -> float:
+        """Wait for /healthz; the seconds since ``start``, which is a time of ``time.monotonic``."""
+        return seconds_until_healthy(self.address, start)
+
     def stop(self, number: int = signal.SIGTERM, seconds: float = 30.0) -> int:
         """Signal it and wait: its exit status. Whatever is left of its group is killed."""
         if self.process.poll() is None:
@@ -118,6 +123,16 @@ class ServerProcess:
             self._reader.join(5)
             assert self.process.stdout is not None
             self.process.stdout.close()
+
+
+def seconds_until_healthy(address: str, start: float) -> float:
+    """Wait for a server's /healthz; the seconds since ``start``, which is a time of ``time.monotonic``."""
+    while True:
+        with contextlib.suppress(httpx.HTTPError):
+            if httpx.get(f"{address}/healthz", timeout=1).status_code == 200:
+                return time.monotonic() - start
+        assert time.monotonic() - start < START_SECONDS, "the server does not come up"
+        time.sleep(0.02)
 
 
 @pytest.fixture(scope="session")

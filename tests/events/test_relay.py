@@ -273,3 +273,25 @@ def test_a_huge_message_is_dropped_and_nothing_else(monkeypatch: pytest.MonkeyPa
         eventually(lambda: heard[-1] == 2)
         assert [size for size in heard if size != 1] == [2**19, 2]
         held.undeclare()  # type: ignore[no-untyped-call]
+
+
+def test_router_that_dies_while_it_starts_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[Router] = []
+
+    def failing_once(configuration: str) -> Router:
+        started.append(Router("no configuration" if len(started) == 1 else configuration))
+        return started[-1]
+
+    monkeypatch.setattr("app.events.bus.Router", failing_once)
+    options = BusOptions(mode="router", listen=f"tcp/127.0.0.1:{free_port()}")
+    bus = Bus(options, ask=nothing, explain=nothing, on_status=nothing, on_alive=nothing)
+    try:
+        eventually(bus.tend, 30)
+        started[0]._process.kill()
+        started[0]._process.wait()
+        assert not bus.tend()
+        assert started[1].problem is not None
+        eventually(bus.tend, 30)
+        assert len(started) == 3
+    finally:
+        bus.close()

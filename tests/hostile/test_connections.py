@@ -196,15 +196,18 @@ REFUSED = [
 ]
 
 
+def send_head(url: str, target: str, token: str, head: str) -> socket.socket:
+    """A connection with the head of a request, whose body has yet to come."""
+    line = connect(url)
+    method, path = target.split()
+    bearer = f"Authorization: Bearer {token}\r\n" if token else ""
+    line.sendall(f"{method} {path} HTTP/1.1\r\nHost: x\r\n{bearer}{head}\r\n".encode())
+    return line
+
+
 def test_refused_body_is_not_awaited(api: Api) -> None:
     """The answer comes, says that the connection closes, and it does: also while the body goes on trickling."""
-    lines = []
-    for target, token, head, _ in REFUSED:
-        line = connect(api.url)
-        method, path = target.split()
-        bearer = f"Authorization: Bearer {token}\r\n" if token else ""
-        line.sendall(f"{method} {path} HTTP/1.1\r\nHost: x\r\n{bearer}{head}\r\n".encode())
-        lines.append(line)
+    lines = [send_head(api.url, target, token, head) for target, token, head, _ in REFUSED]
     for line, (target, _, head, status) in zip(lines, REFUSED, strict=True):
         chunk = b"1\r\n \r\n" if "chunked" in head else b" "
         with line:
@@ -285,6 +288,20 @@ def test_unfinished_handshakes_are_bounded(tmp_path: Path) -> None:
             assert read_to_end(line)[0].startswith(b"HTTP/1.1 401 ")
 
 
+def trickle(address: str, number: int, flood: list[socket.socket]) -> Iterator[None]:
+    """Open connections that send a byte now and then, of a head or a body without a token; yields at each 100th."""
+    for k in range(number):
+        line = connect(address)
+        head = f"POST /api/v1/environments HTTP/1.1\r\nHost: x\r\n{JSON_HEAD}"
+        line.sendall((head + ("\r\n" if k % 2 else "X-Slow: ")).encode())
+        flood.append(line)
+        if k % 100 == 0:
+            for other in flood:
+                with contextlib.suppress(OSError):
+                    other.send(b" ")
+            yield
+
+
 def test_server_answers_during_a_flood_of_slow_connections(tmp_path: Path) -> None:
     """600 sockets send a byte a second each: some a head, some a body without a token. All others get their answer."""
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -301,23 +318,11 @@ def test_server_answers_during_a_flood_of_slow_connections(tmp_path: Path) -> No
             assert known.get("/api/v1/formats").status_code == 200
             stream = known.stream("GET", "/api/v1/events")
             assert stream.__enter__().status_code == 200
-            for k in range(number):
-                line = connect(process.address)
-                head = f"POST /api/v1/environments HTTP/1.1\r\nHost: x\r\n{JSON_HEAD}"
-                line.sendall((head + ("\r\n" if k % 2 else "X-Slow: ")).encode())
-                flood.append(line)
-                if k % 100 == 0:
-                    for other in flood:
-                        with contextlib.suppress(OSError):
-                            other.send(b" ")
-                    assert httpx.get(f"{process.address}/healthz", timeout=PATIENCE_SECONDS).status_code == 200
-                    assert (
-                        httpx.get(
-                            f"{process.address}/api/v1/environments", headers=HEADERS, timeout=PATIENCE_SECONDS
-                        ).status_code
-                        == 200
-                    )
-                    assert known.get("/api/v1/formats").status_code == 200
+            for _ in trickle(process.address, number, flood):
+                for path in ("/healthz", "/api/v1/environments"):
+                    answer = httpx.get(f"{process.address}{path}", headers=HEADERS, timeout=PATIENCE_SECONDS)
+                    assert answer.status_code == 200
+                assert known.get("/api/v1/formats").status_code == 200
             opened = len(list(Path(f"/proc/{process.process.pid}/fd").iterdir()))
             assert opened < 200 + 100
             stream.__exit__(None, None, None)

@@ -116,18 +116,21 @@ def upload(row: Row) -> dict[str, bytes]:
     return {str(p.relative_to(SAMPLES)): p.read_bytes() for p in (beside if row.sample.count("/") > 1 else [main])}
 
 
+def changed(row: Row) -> dict[str, bytes]:
+    files = upload(row)
+    text, count = re.subn(row.old, row.new, files[row.sample].decode(), count=1)
+    assert count == 1, f"{row.old} is not in {row.sample}"
+    return {**files, row.sample: text.encode()}
+
+
 def read(files: dict[str, bytes]) -> list[Problem]:
     return bundle.read(files, Hints(), HERE, Limits()).warnings
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.sample.partition('/')[0]}: {row.new[:40]}")
 def test_changed_sample_is_refused_or_reported(row: Row) -> None:
-    files = upload(row)
-    plain = {w.problem for w in read(files)}
-    text = files[row.sample].decode()
-    changed, count = re.subn(row.old, row.new, text, count=1)
-    assert count == 1, f"{row.old} is not in {row.sample}"
-    files[row.sample] = changed.encode()
+    plain = {w.problem for w in read(upload(row))}
+    files = changed(row)
     if row.refused:
         with pytest.raises(BadUpload) as caught:
             read(files)
