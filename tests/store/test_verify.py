@@ -11,6 +11,8 @@ from sqlalchemy import exc
 
 from app.errors import Damaged, DatabaseDamaged, NoRoom, Unavailable
 from app.store.changes import Changes
+from app.store.chunks import insert
+from app.store.encode import compress, digest
 from app.store.scrub import LOCK, Scrub, figures, read_state
 from app.store.store import Store
 from app.store.values import Source
@@ -200,3 +202,18 @@ def test_errors_of_postgresql_have_their_meaning(sqlite_store: Store, state: str
     if kind is DatabaseDamaged:
         with pytest.raises(DatabaseDamaged, match="fleetmap verify"):
             sqlite_store.check()
+
+
+def test_only_chunks_that_are_still_damaged_and_unused_are_removed(store: Store) -> None:
+    raws = {digest(raw).hex(): raw for raw in (b"healed" * 50, b"in use" * 50, b"unused" * 50)}
+    healed, in_use, unused = raws
+    with store._database.write() as connection:
+        insert(connection, dict.fromkeys(raws, b"damaged"), now=time.time() - 100)
+    found = store.verifier().run()
+    assert {f.name for f in found.findings} == set(raws)
+    with store._database.write() as connection:  # uploads of other processes, while the check goes on
+        insert(connection, {healed: compress(raws[healed])}, now=time.time() - 50)
+        insert(connection, {in_use: b"damaged"})
+    assert store.remove_unused_chunks(found) == {unused}
+    assert store.chunk(healed) == raws[healed]
+    assert {f.name for f in store.verifier().run().findings} == {in_use}
