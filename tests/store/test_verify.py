@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -202,6 +204,48 @@ def test_errors_of_postgresql_have_their_meaning(sqlite_store: Store, state: str
     if kind is DatabaseDamaged:
         with pytest.raises(DatabaseDamaged, match="fleetmap verify"):
             sqlite_store.check()
+
+
+def test_a_missing_library_of_postgresql_is_no_damage(sqlite_store: Store) -> None:
+    class Refused(Exception):
+        sqlstate = "58P01"
+
+    library = 'could not access file "$libdir/postgis-3": No such file or directory'
+    with pytest.raises(Unavailable, match="postgis-3") as caught, sqlite_store._database.read():
+        raise exc.OperationalError("SELECT 1", {}, Refused(library))
+    assert not isinstance(caught.value, DatabaseDamaged)
+    sqlite_store.check()
+
+
+def test_one_check_of_the_pages_at_a_time(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    database, release, checks = sqlite_store._database, threading.Event(), list[int]()
+
+    def integrity(limit: int) -> str:
+        checks.append(limit)
+        assert release.wait(30)
+        return "a page is bad"
+
+    monkeypatch.setattr(database, "integrity", integrity)
+    database._damage = time.monotonic() - 100, "the database is damaged"
+
+    def check() -> None:
+        with pytest.raises(DatabaseDamaged, match="the database is damaged"):
+            database.check()
+
+    with ThreadPoolExecutor(1) as first:
+        running = first.submit(check)
+        while not checks:
+            time.sleep(0.01)
+        for _ in range(5):
+            check()
+        release.set()
+        running.result(30)
+    check()
+    assert len(checks) == 1
+    database._damage = time.monotonic() - 100, "the database is damaged"
+    monkeypatch.setattr(database, "integrity", lambda limit: None)
+    database.check()
+    database.check()
 
 
 def test_only_chunks_that_are_still_damaged_and_unused_are_removed(store: Store) -> None:
