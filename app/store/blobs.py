@@ -17,7 +17,7 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -427,18 +427,29 @@ class Blobs:
         """Hash everything; the names of what is damaged or lost."""
         return [name for name, _, problem in self.checked() if problem is not None]
 
-    def checked(self, after: str = "") -> Iterator[tuple[str, int, str | None]]:
-        """Hash one file after the other, by their names: (name, bytes, ``lost``, ``damaged`` or None)."""
+    def checked(
+        self, after: str = "", skip: Callable[[str, Unavailable], None] | None = None
+    ) -> Iterator[tuple[str, int, str | None]]:
+        """Hash one file after the other, by their names: (name, bytes, ``lost``, ``damaged`` or None).
+
+        skip: called for one that cannot be read at the moment; without it, that raises Unavailable.
+        """
         while True:
             query = select(blob.c.sha256).where(blob.c.sha256 > after).order_by(blob.c.sha256).limit(BATCH)
             with self._database.read() as connection:
                 rows = self._rows(connection, list(connection.execute(query).scalars()))
             for name, row in sorted(rows.items()):
-                problem = self._problem(name, row)
-                if problem is not None:  # it may have moved to another pack, or gone, between the query and the read
-                    with self._database.read() as connection:
-                        moved = self._rows(connection, [name]).get(name)
-                    problem = None if moved is None else self._problem(name, moved)
+                try:
+                    problem = self._problem(name, row)
+                    if problem is not None:  # it may have moved to another pack, or gone, since the query
+                        with self._database.read() as connection:
+                            moved = self._rows(connection, [name]).get(name)
+                        problem = None if moved is None else self._problem(name, moved)
+                except _Unreadable as error:
+                    if skip is None:
+                        raise
+                    skip(name, error)
+                    continue
                 yield name, row.size, problem
             if len(rows) < BATCH:
                 return
@@ -452,8 +463,12 @@ def _read_error(sha256: str, error: OSError) -> FleetMapError:
     return _unreadable(error)
 
 
-def _unreadable(error: OSError) -> Unavailable:
-    return Unavailable(f"the blob folder cannot be read: {reason_of(error)}. Try again later")
+class _Unreadable(Unavailable):
+    """A file that cannot be read at the moment, in contrast to a database that does not answer."""
+
+
+def _unreadable(error: OSError) -> _Unreadable:
+    return _Unreadable(f"the blob folder cannot be read: {reason_of(error)}. Try again later")
 
 
 def _refusal(error: OSError) -> Unavailable:

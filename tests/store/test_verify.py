@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy import exc
 
 from app.errors import Damaged, DatabaseDamaged, NoRoom, Unavailable
+from app.store.blobs import _unreadable
 from app.store.changes import Changes
 from app.store.chunks import insert
 from app.store.encode import compress, digest
@@ -124,6 +127,59 @@ def test_the_scrub_finds_damage_goes_on_after_a_stop_and_tells_its_age(store: St
     assert 0 <= figures(state)["age"] < 60
     scrub.pass_if_due()
     assert read_state(store.blob_dir) == state, "the next pass is not due yet"
+
+
+def test_a_scrub_that_is_stopped_again_and_again_counts_once(
+    sqlite_store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sqlite_store, "check_pages", lambda: "a page is bad")
+    for stopped in (True, True, True, False):
+        scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9)
+        if stopped:
+            scrub._stopped.set()
+        scrub.pass_if_due()
+    assert read_state(sqlite_store.blob_dir).findings == {"database": 1}
+
+
+def test_a_scrub_passes_over_what_cannot_be_read(
+    sqlite_store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = sorted(sqlite_store.blobs.put(bytes([k]) * 100) for k in range(3))
+    real = sqlite_store.blobs._problem
+
+    def problem(name: str, row: Any) -> str | None:
+        if name == names[0]:
+            raise _unreadable(PermissionError(errno.EACCES, "refused", "/srv/data"))
+        return "damaged" if name == names[1] else real(name, row)
+
+    monkeypatch.setattr(sqlite_store.blobs, "_problem", problem)
+    Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9).pass_if_due()
+    assert read_state(sqlite_store.blob_dir).findings == {"blob": 1}
+    assert "Permission denied" in caplog.text
+    assert "/srv" not in caplog.text
+
+
+def test_a_scrub_survives_a_defect(
+    sqlite_store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("app.store.scrub.POLL_SECONDS", 0.01)
+    errors = [ValueError("a defect"), *[OSError(errno.EIO, "refused", "/srv/data")] * 2]
+
+    def check_pages() -> None:
+        if errors:
+            raise errors.pop(0)
+
+    monkeypatch.setattr(sqlite_store, "check_pages", check_pages)
+    scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9, delay=0.0)
+    scrub.start()
+    deadline = time.monotonic() + 30
+    while not read_state(sqlite_store.blob_dir).completed:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    scrub.close()
+    assert "a defect" in caplog.text
+    assert caplog.text.count("Input/output error") == 1
+    assert "/srv" not in caplog.text
 
 
 def test_one_process_scrubs(sqlite_store: Store) -> None:
