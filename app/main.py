@@ -296,7 +296,7 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         try:
             return pool.run(function, *args, **more)
         except DatabaseDamaged as error:  # a worker met it
-            store.note_damage(error.detail)
+            store.note_damage(error)
             raise
 
     metrics = Metrics()

@@ -235,6 +235,11 @@ class Database:
             return error.detail
         return None if lines == ["ok"] else "; ".join(map(str, lines))
 
+    def note_damage_of(self, error: DatabaseDamaged) -> None:
+        """Report damage that another process met. A file that is missing is checked anew for each request."""
+        if not isinstance(error, _FileGone):
+            self.note_damage(error.detail)
+
     def note_damage(self, detail: str) -> None:
         """Report damage that was found: from now on ``check`` fails."""
         first = self._damage is None

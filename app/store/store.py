@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sqlalchemy import select
 
-from app.errors import Damaged
+from app.errors import Damaged, DatabaseDamaged
 from app.store import schema, tables
 from app.store.audit import Audit, record
 from app.store.base import environment_row
@@ -87,9 +87,9 @@ class Store(
         self.blobs.check()
         self._database.check_room()
 
-    def note_damage(self, detail: str) -> None:
+    def note_damage(self, error: DatabaseDamaged) -> None:
         """Report that another process found the database damaged: from now on ``check`` fails."""
-        self._database.note_damage(detail)
+        self._database.note_damage_of(error)
 
     def verifier(self, progress: Progress = lambda kind, size: None) -> Verifier:
         """Checks of everything that is stored."""

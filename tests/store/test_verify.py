@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import pickle
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -271,6 +272,19 @@ def test_a_missing_library_of_postgresql_is_no_damage(sqlite_store: Store) -> No
         raise exc.OperationalError("SELECT 1", {}, Refused(library))
     assert not isinstance(caught.value, DatabaseDamaged)
     sqlite_store.check()
+
+
+def test_a_file_that_a_worker_missed_is_no_lasting_damage(sqlite_store: Store) -> None:
+    file = Path(sqlite_store.database_url.removeprefix("sqlite:///"))
+    away = file.rename(file.with_suffix(".away"))
+    with pytest.raises(DatabaseDamaged, match="missing") as caught:
+        sqlite_store.environments()
+    sqlite_store.note_damage(pickle.loads(pickle.dumps(caught.value)))  # noqa: S301  as from a worker
+    away.rename(file)
+    sqlite_store.check()
+    sqlite_store.note_damage(DatabaseDamaged("a page is bad"))
+    with pytest.raises(DatabaseDamaged, match="a page is bad"):
+        sqlite_store.check()
 
 
 def test_one_check_of_the_pages_at_a_time(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
