@@ -279,7 +279,7 @@ def test_a_file_that_a_worker_missed_is_no_lasting_damage(sqlite_store: Store) -
     away = file.rename(file.with_suffix(".away"))
     with pytest.raises(DatabaseDamaged, match="missing") as caught:
         sqlite_store.environments()
-    sqlite_store.note_damage(pickle.loads(pickle.dumps(caught.value)))  # noqa: S301  as from a worker
+    sqlite_store.note_damage(pickle.loads(pickle.dumps(caught.value)))
     away.rename(file)
     sqlite_store.check()
     sqlite_store.note_damage(DatabaseDamaged("a page is bad"))
