@@ -6,12 +6,21 @@ Every error says in ``detail`` what went wrong and what the user can do about it
 from __future__ import annotations
 
 import errno
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """What writing fails with where the disk is full, or a quota or the process's limit is reached."""
+
+BROKEN = frozenset({errno.EIO, errno.EBADMSG, errno.EUCLEAN})
+"""What reading damaged storage fails with. All others (too many open files, no permission) say nothing about bytes."""
+
+
+def reason_of(error: OSError) -> str:
+    """Why the system refuses, without the path, for clients and the log."""
+    return os.strerror(error.errno) if error.errno else type(error).__name__
 
 
 @dataclass(frozen=True, slots=True)

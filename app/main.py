@@ -65,7 +65,7 @@ from app.api.jobs import BEAT_SECONDS, Work
 from app.api.maps import Hot, Server
 from app.api.metrics import Metrics
 from app.api.protocol import BoundedProtocol, tls_context
-from app.api.services import ApiOptions, Services
+from app.api.services import ApiOptions, Services, Writability
 from app.api.signed import SignedLinks
 from app.api.uploads import Intake
 from app.config import Settings
@@ -296,7 +296,7 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         try:
             return pool.run(function, *args, **more)
         except DatabaseDamaged as error:  # a worker met it
-            store.note_damage(error.detail)
+            store.note_damage(error)
             raise
 
     metrics = Metrics()
@@ -341,6 +341,7 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         links=SignedLinks(secrets, access, store.environment, int(settings.link_seconds)),
         deltas=Deltas(service.cache),
         fleet=FleetIntake(store, bus_vouches=_bus_vouches(settings)),
+        writability=Writability(store.check_writable, intake.check),
     )
 
 

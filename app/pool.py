@@ -60,7 +60,7 @@ class Stop:
         with self._lock:
             self.called = True
             if self._process is not None:
-                self._process.kill()
+                _kill(self._process)
 
     def check(self) -> None:
         """Cancelled where it was called."""
@@ -171,7 +171,7 @@ class Pool:
             self._closed = True
             workers = list(self._workers.values())
         for worker in workers:
-            worker.process.kill()
+            _kill(worker.process)
         for _ in range(self._count):
             with contextlib.suppress(queue.Empty):
                 self._end(self._idle.get_nowait())
@@ -207,9 +207,15 @@ class Pool:
             return
         with self._lock:
             self._workers.pop(id(worker), None)
-        worker.process.kill()
+        _kill(worker.process)
         worker.process.join(5.0)
         worker.pipe.close()
+
+
+def _kill(process: BaseProcess) -> None:
+    """End a worker. It is no child of this process: once it has ended, its number may be another process'."""
+    if process.is_alive():
+        process.kill()
 
 
 def _ask(worker: _Worker, function: Callable[..., Any], args: tuple[Any, ...], seconds: float) -> tuple[bool, Any]:

@@ -98,6 +98,23 @@ def test_a_crash_costs_one_job_and_a_fresh_worker_goes_on(pool: Pool) -> None:
     assert pool.run(work_double, 1) == 2
 
 
+def test_a_worker_that_ended_is_not_killed(pool: Pool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its number may belong to another process by then."""
+    pool.run(work_double, 1)
+    killed: list[int | None] = []
+    (worker,) = pool._workers.values()
+    monkeypatch.setattr(type(worker.process), "kill", lambda process: killed.append(process.pid))
+    stop = Stop()
+    stop.hold(worker.process)
+    assert worker.process.pid is not None
+    os.kill(worker.process.pid, signal.SIGKILL)
+    worker.process.join(20)
+    stop()
+    with pytest.raises(WorkerDied):
+        pool.run(work_double, 1)
+    assert killed == []
+
+
 def test_an_overrun_is_stopped_and_a_fresh_worker_goes_on(pool: Pool) -> None:
     pool.run(work_double, 1)
     start = time.monotonic()

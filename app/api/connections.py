@@ -32,6 +32,9 @@ WARN_SECONDS = 60.0
 OTHER_FILES = 512
 """Descriptors for all else: database, cache, workers, the router."""
 
+FILES_PER_CONNECTION = 2
+"""Its socket, and the file that it may be streamed."""
+
 
 @dataclass(frozen=True, slots=True)
 class ConnectionLimits:
@@ -143,14 +146,14 @@ class Connections:
 
 def fit_open_files(total: int) -> int:
     """Raise this process' limit of open files for so many connections; how many of them it allows."""
-    wanted = total + OTHER_FILES
+    wanted = total * FILES_PER_CONNECTION + OTHER_FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         soft = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     if soft == resource.RLIM_INFINITY or soft >= wanted:
         return total
-    fitting = max(soft - OTHER_FILES, soft // 2)
+    fitting = max(soft - OTHER_FILES, soft // 2) // FILES_PER_CONNECTION
     log.warning(
         "connections: the limit of open files (%d) allows %d of %d: raise it (ulimit -Hn, LimitNOFILE) or lower "
         "FLEETMAP_MAX_CONNECTIONS",

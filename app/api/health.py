@@ -78,7 +78,7 @@ async def readyz(
     try:
         async with asyncio.timeout(READY_SECONDS):
             await run_in_threadpool(here.store.check)
-            refusal = await run_in_threadpool(_refusal, here)
+            refusal = await run_in_threadpool(here.writability.refusal)
     except TimeoutError:
         raise Unavailable(f"database or file store did not answer within {READY_SECONDS:g} seconds") from None
     if refusal is not None and for_ == "writes":
@@ -100,16 +100,6 @@ async def readyz(
         "cache": here.maps.cache.problem or "ok",
     }
     return answer({**state, "events": events, **topics})
-
-
-def _refusal(here: Services) -> str | None:
-    """Why nothing can be stored at the moment, None where it can."""
-    try:
-        here.store.check_writable()
-        here.intake.check()
-    except Unavailable as error:
-        return error.detail
-    return None
 
 
 @router.get(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +14,7 @@ from fastapi import Depends, Request
 from app.api.access import Access
 from app.api.signed import SignedLinks
 from app.convert.maps import Maps
+from app.errors import Unavailable
 from app.fleet import Intake as FleetIntake
 from app.formats import Limits
 from app.ingest import Ingest
@@ -25,6 +28,11 @@ if TYPE_CHECKING:
     from app.api.maps import Hot
     from app.api.metrics import Metrics
     from app.api.uploads import Intake
+
+WRITABLE_SECONDS = 2.0
+"""How long it is remembered whether something can be stored."""
+
+PROBE_SECONDS = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +54,42 @@ class ApiOptions:
     manifest_seconds: int = 86_400
 
 
+class Writability:
+    """Whether something can be stored. Thread-safe; ``checks`` run at most every WRITABLE_SECONDS, once at a time."""
+
+    def __init__(self, *checks: Callable[[], None]) -> None:
+        self._checks = checks
+        self._lock = threading.Lock()
+        self._until = 0.0
+        self._refusal: str | None = None
+
+    def refusal(self) -> str | None:
+        """Why nothing can be stored at the moment, None where it can."""
+        if time.monotonic() < self._until:
+            return self._refusal
+        if not self._lock.acquire(timeout=PROBE_SECONDS):
+            return f"the disk did not answer within {PROBE_SECONDS:g} seconds"
+        try:
+            if time.monotonic() >= self._until:
+                self._refusal = self._check()
+                self._until = time.monotonic() + WRITABLE_SECONDS
+            return self._refusal
+        finally:
+            self._lock.release()
+
+    def _check(self) -> str | None:
+        try:
+            for check in self._checks:
+                check()
+        except Unavailable as error:
+            return error.detail
+        return None
+
+    def forget(self) -> None:
+        """Check again at the next request."""
+        self._until = 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class Services:
     """The parts of the server that routes use."""
@@ -64,6 +108,7 @@ class Services:
     links: SignedLinks
     deltas: Deltas
     fleet: FleetIntake
+    writability: Writability
     prepared: threading.Event = field(default_factory=threading.Event)
     """Set once the first map and the first coverage table need not wait for anything to be loaded."""
 

@@ -13,7 +13,7 @@ import typer
 from app.cli import local, options, output
 from app.cli.client import Client
 from app.cli.problems import Refused
-from app.errors import Damaged, FleetMapError, Invalid
+from app.errors import FleetMapError, Invalid
 
 if TYPE_CHECKING:
     from app.config import Settings
@@ -70,7 +70,7 @@ def verify(
         raise Invalid(f"{settings.blob_dir}: no folder of stored files is there: name the server's by --data-dir")
     with ExitStack() as stack:
         store = stack.enter_context(closing(_open(settings, readonly=not repair)))
-        found = _check(store)
+        found = latest = _check(store)
         left, healed = found.findings, dict[tuple[str, str], str]()
         for _ in range(MAX_ROUNDS if repair else 0):
             if not left:
@@ -78,11 +78,12 @@ def verify(
             donors = [_donor(place, token, left, stack) for place in sources or ()]
             fresh = _repair(store, left, donors, settings)
             if not fresh and not any(f.versions or f.kind != "chunk" for f in left):
-                fresh = {("chunk", name): REMOVED for name in store.remove_unused_chunks(left)}
+                fresh = {("chunk", name): REMOVED for name in store.remove_unused_chunks(latest)}
             if not fresh:
                 break
             healed |= fresh
-            left = _check(store).findings  # what lay below a lost chunk is found only now
+            latest = _check(store)  # what lay below a lost chunk is found only now
+            left = latest.findings
             known = {(f.kind, f.name) for f in found.findings}
             found.findings += [f for f in left if (f.kind, f.name) not in known]
     for f in left:  # what a failing disk spoils again counts as damaged
@@ -175,7 +176,7 @@ class StoreDonor:
         """The bytes, if they are there and intact."""
         try:
             return self._store.chunk(sha256)
-        except Damaged:
+        except FleetMapError:
             return None
 
 

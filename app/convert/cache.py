@@ -12,7 +12,6 @@ read-only), maps are made all the same and kept in memory for a while.
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import hashlib
 import logging
@@ -33,7 +32,7 @@ from uuid import uuid4
 
 import orjson
 
-from app.errors import Unavailable
+from app.errors import BROKEN, NO_ROOM, Unavailable, reason_of
 
 log = logging.getLogger(__name__)
 
@@ -42,9 +41,6 @@ FRESH_SECONDS = 60.0
 
 SPARE_BYTES = 64 * 2**20
 """Room in memory for maps that the disk refused; the newest stays, whatever its size."""
-
-BROKEN = frozenset({errno.EIO, errno.EBADMSG, errno.EUCLEAN})
-"""What reading damaged storage fails with."""
 
 MAX_CHECKED = 100_000
 """Entries of which it is remembered that they were hashed."""
@@ -91,7 +87,7 @@ class MadeFile:
         if error is None:
             self.on_damage(f"{self.name!r} does not match its hash")
         elif error.errno in BROKEN:  # not where the cache only needed the room
-            self.on_damage(f"{self.name!r} cannot be read: {error.strerror}")
+            self.on_damage(f"{self.name!r} cannot be read: {reason_of(error)}")
         return LostMap(f"the cached {self.name!r} was lost while it was read: request it again")
 
 
@@ -158,7 +154,7 @@ class Cache:
         try:
             (folder / "locks").mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            self._note_problem(error)
+            self._note_problem(reason_of(error))
         for old in folder.glob("making-*"):
             with contextlib.suppress(OSError):
                 if time.time() - old.stat().st_mtime > ABANDONED_SECONDS:
@@ -194,7 +190,7 @@ class Cache:
         return made
 
     def _read_entry(self, key: str) -> tuple[Made, tuple[int, int, int]] | None:
-        """What ``map.json`` describes; None where it is absent or not intact.
+        """What ``map.json`` describes; None where it is absent, cannot be read at the moment, or is not intact.
 
         The stamp with it changes when any of its files is written to or lost.
         """
@@ -202,10 +198,9 @@ class Cache:
         try:
             with (folder / "map.json").open("rb") as file:
                 status, raw = os.fstat(file.fileno()), file.read()
-        except FileNotFoundError:
-            return None
         except OSError as error:
-            self.discard(key, f"map.json: {error}")
+            if error.errno in BROKEN:
+                self.discard(key, f"map.json cannot be read: {reason_of(error)}")
             return None
         line, _, text = raw.partition(b"\n")
         if line != hashlib.sha256(text).hexdigest().encode() or (described := orjson.loads(text))["key"] != key:
@@ -292,7 +287,7 @@ class Cache:
             assert folder is not None
             folder.mkdir()
         except OSError as error:
-            self._note_problem(error)
+            self._note_problem(reason_of(error))
             folder = None
 
         def hold(made: Made) -> Made:
@@ -324,9 +319,11 @@ class Cache:
         try:
             made = self._write(key, product)
         except OSError as error:
-            self._note_problem(error)
+            self._note_problem(reason_of(error))
             return self._keep_spare(key, product)
         self._note_problem(None)
+        if made is None:
+            return self._keep_spare(key, product)
         for file in made.every():
             self._note_hash(file)
         self._total += sum(f.size for f in made.every())
@@ -334,8 +331,11 @@ class Cache:
             self._make_room()
         return made
 
-    def _write(self, key: str, product: Product) -> Made:
-        """The entry on disk. OSError where the disk refuses; LostMap where a file of the product is damaged."""
+    def _write(self, key: str, product: Product) -> Made | None:
+        """The entry on disk; None where it is removed or cannot be read as soon as it is there.
+
+        OSError where the disk refuses; LostMap where a file of the product is damaged.
+        """
         making = self._folder / f"making-{uuid4().hex}"
         making.mkdir()
         try:
@@ -357,8 +357,8 @@ class Cache:
         finally:
             shutil.rmtree(making, ignore_errors=True)
         entry = self._read_entry(key)
-        if entry is None:
-            raise OSError(f"the cache folder {self._folder} does not keep what is written to it")
+        if entry is None:  # another process needed the room, or it does not match its hash, which is reported
+            return None
         made, stamp = entry
         self._note_checked(key, stamp)  # the hashes are of the bytes as they were made, not as the disk has them
         self._sync_later(key)
@@ -377,10 +377,9 @@ class Cache:
         try:
             for path in (*folder.iterdir(), folder, folder.parent):
                 sync(path)
-        except FileNotFoundError:
-            return  # the cache needed the room
-        except OSError as error:
-            self.discard(key, f"it could not be written: {error}")
+        except OSError as error:  # else it is gone, since the cache needed the room, or is hashed again as any other
+            if error.errno in BROKEN | NO_ROOM:
+                self.discard(key, f"it could not be written: {reason_of(error)}")
 
     def _keep_spare(self, key: str, product: Product) -> Made:
         """The map in memory."""
@@ -399,9 +398,8 @@ class Cache:
                 self._spare.popitem(last=False)
         return made
 
-    def _note_problem(self, error: OSError | None) -> None:
+    def _note_problem(self, reason: str | None) -> None:
         """Log that the disk refuses, or works again: once each."""
-        reason = None if error is None else str(error.strerror or error)
         if (reason is None) != (self.problem is None):
             if reason is None:
                 log.warning("cache: maps are kept on disk again")
@@ -478,7 +476,7 @@ class Cache:
                 try:
                     fcntl.flock(stack.enter_context(path.open("w")), fcntl.LOCK_EX)
                 except OSError as error:  # without room for a lock two processes may make the same map
-                    self._note_problem(error)
+                    self._note_problem(reason_of(error))
                 yield
         with self._guard:
             if not lock.locked():

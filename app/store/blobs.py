@@ -9,7 +9,6 @@ in progress leaves it alone.
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import hashlib
 import io
@@ -18,8 +17,8 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -27,7 +26,17 @@ from typing import BinaryIO, Final
 from sqlalchemy import Connection, bindparam, delete, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
-from app.errors import NO_ROOM, Damaged, Invalid, NoRoom, NotFound, Unavailable
+from app.errors import (
+    BROKEN,
+    NO_ROOM,
+    Damaged,
+    FleetMapError,
+    Invalid,
+    NoRoom,
+    NotFound,
+    Unavailable,
+    reason_of,
+)
 from app.store.database import Database, check_room
 from app.store.tables import blob
 
@@ -177,8 +186,8 @@ class Blobs:
         except FileNotFoundError:
             return "lost"
         except OSError as error:
-            if error.errno != errno.EIO:
-                raise
+            if error.errno not in BROKEN:
+                raise _unreadable(error) from error
             return "damaged"
         return None if whole and digest.hexdigest() == name else "damaged"
 
@@ -274,21 +283,25 @@ class Blobs:
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise Unavailable(f"the blob folder cannot be read: {error.strerror or error}. Try again later") from error
+            raise _read_error(name, error) from error
 
     def open(self, sha256: str) -> BinaryIO:
         """The content as a seekable file, hashed again before it is handed out; for big ones that are read in parts."""
         row = self._row(sha256)
         if row.pack is not None:
             return io.BytesIO(self.get(sha256))
-        try:
-            file = self._path(sha256).open("rb")
-        except OSError as error:
-            raise Damaged(f"the stored file {sha256} is lost: {REPAIR}") from error
-        if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
-            file.close()
-            raise Damaged(f"the stored file {sha256} does not match its hash: {REPAIR}")
-        file.seek(0)
+        with ExitStack() as stack:
+            try:
+                file = stack.enter_context(self._path(sha256).open("rb"))
+                name = hashlib.file_digest(file, "sha256").hexdigest()
+                file.seek(0)
+            except FileNotFoundError as error:
+                raise Damaged(f"the stored file {sha256} is lost: {REPAIR}") from error
+            except OSError as error:
+                raise _read_error(sha256, error) from error
+            if name != sha256:
+                raise Damaged(f"the stored file {sha256} does not match its hash: {REPAIR}")
+            stack.pop_all()
         return file
 
     def path(self, sha256: str) -> Path | None:
@@ -414,31 +427,57 @@ class Blobs:
         """Hash everything; the names of what is damaged or lost."""
         return [name for name, _, problem in self.checked() if problem is not None]
 
-    def checked(self, after: str = "") -> Iterator[tuple[str, int, str | None]]:
-        """Hash one file after the other, by their names: (name, bytes, ``lost``, ``damaged`` or None)."""
+    def checked(
+        self, after: str = "", skip: Callable[[str, Unavailable], None] | None = None
+    ) -> Iterator[tuple[str, int, str | None]]:
+        """Hash one file after the other, by their names: (name, bytes, ``lost``, ``damaged`` or None).
+
+        skip: called for one that cannot be read at the moment; without it, that raises Unavailable.
+        """
         while True:
             query = select(blob.c.sha256).where(blob.c.sha256 > after).order_by(blob.c.sha256).limit(BATCH)
             with self._database.read() as connection:
                 rows = self._rows(connection, list(connection.execute(query).scalars()))
             for name, row in sorted(rows.items()):
-                problem = self._problem(name, row)
-                if problem is not None:  # it may have moved to another pack, or gone, between the query and the read
-                    with self._database.read() as connection:
-                        moved = self._rows(connection, [name]).get(name)
-                    problem = None if moved is None else self._problem(name, moved)
+                try:
+                    problem = self._problem(name, row)
+                    if problem is not None:  # it may have moved to another pack, or gone, since the query
+                        with self._database.read() as connection:
+                            moved = self._rows(connection, [name]).get(name)
+                        problem = None if moved is None else self._problem(name, moved)
+                except _Unreadable as error:
+                    if skip is None:
+                        raise
+                    skip(name, error)
+                    continue
                 yield name, row.size, problem
             if len(rows) < BATCH:
                 return
             after = max(rows)
 
 
+def _read_error(sha256: str, error: OSError) -> FleetMapError:
+    """Damaged for broken storage; Unavailable for what may work later, like too many open files."""
+    if error.errno in BROKEN:
+        return Damaged(f"the stored file {sha256} cannot be read ({reason_of(error)}): {REPAIR}")
+    return _unreadable(error)
+
+
+class _Unreadable(Unavailable):
+    """A file that cannot be read at the moment, in contrast to a database that does not answer."""
+
+
+def _unreadable(error: OSError) -> _Unreadable:
+    return _Unreadable(f"the blob folder cannot be read: {reason_of(error)}. Try again later")
+
+
 def _refusal(error: OSError) -> Unavailable:
     if error.errno in NO_ROOM:
         return NoRoom(
-            f"the server has no room left for files ({error.strerror}); nothing was stored. Try again once its "
+            f"the server has no room left for files ({reason_of(error)}); nothing was stored. Try again once its "
             "operator has made room"
         )
-    return Unavailable(f"the blob folder cannot be written: {error.strerror or error}. Try again later")
+    return Unavailable(f"the blob folder cannot be written: {reason_of(error)}. Try again later")
 
 
 def _upsert(connection: Connection, rows: Sequence[Mapping[str, object]]) -> None:

@@ -72,15 +72,7 @@ class Chunks:
 
     def _rows(self, hashes: Sequence[bytes]) -> list[tuple[bytes, bytes]]:
         with self._database.read() as connection:
-            if self._database.sqlite:
-                marks = ",".join("?" * len(hashes))
-                rows = connection.exec_driver_sql(
-                    f"SELECT hash, data FROM chunk WHERE hash IN ({marks})",  # noqa: S608 - only question marks
-                    tuple(hashes),
-                )
-            else:
-                rows = connection.exec_driver_sql("SELECT hash, data FROM chunk WHERE hash = ANY(%s)", (list(hashes),))
-            return [(bytes(name), bytes(data)) for name, data in rows.fetchall()]
+            return list(select_rows(connection, hashes))
 
     def _query(self, hashes: Sequence[bytes]) -> dict[bytes, bytes]:
         out: dict[bytes, bytes] = {}
@@ -141,19 +133,35 @@ def insert(connection: Connection, chunks: Mapping[str, bytes], now: float | Non
     )
 
 
-def delete(connection: Connection, hashes: Iterable[bytes], before: int) -> int:
-    """Remove those of the chunks that were last used before this second; how many."""
-    count = 0
-    some = sorted(hashes)
-    for start in range(0, len(some), BATCH):
-        batch = some[start : start + BATCH]
+def select_rows(connection: Connection, hashes: Sequence[bytes]) -> Iterator[tuple[bytes, bytes]]:
+    """Hash and stored bytes of those of the chunks that are there."""
+    columns = "SELECT hash, data FROM chunk WHERE hash"
+    for batch in _batches(hashes):
         if connection.dialect.name == "sqlite":
             marks = ",".join("?" * len(batch))
-            result = connection.exec_driver_sql(
-                f"DELETE FROM chunk WHERE hash IN ({marks}) AND used < ?",  # noqa: S608 - only question marks
+            rows = connection.exec_driver_sql(f"{columns} IN ({marks})", tuple(batch))
+        else:
+            rows = connection.exec_driver_sql(f"{columns} = ANY(%s)", (batch,))
+        yield from ((bytes(name), bytes(data)) for name, data in rows.fetchall())
+
+
+def delete(connection: Connection, hashes: Iterable[bytes], before: int) -> list[bytes]:
+    """Remove those of the chunks that were last used before this second; which."""
+    out: list[bytes] = []
+    for batch in _batches(sorted(hashes)):
+        if connection.dialect.name == "sqlite":
+            marks = ",".join("?" * len(batch))
+            rows = connection.exec_driver_sql(
+                f"DELETE FROM chunk WHERE hash IN ({marks}) AND used < ? RETURNING hash",  # noqa: S608 - only marks
                 (*batch, before),
             )
         else:
-            result = connection.exec_driver_sql("DELETE FROM chunk WHERE hash = ANY(%s) AND used < %s", (batch, before))
-        count += result.rowcount
-    return count
+            rows = connection.exec_driver_sql(
+                "DELETE FROM chunk WHERE hash = ANY(%s) AND used < %s RETURNING hash", (batch, before)
+            )
+        out += [bytes(name) for (name,) in rows.fetchall()]
+    return out
+
+
+def _batches(hashes: Sequence[bytes]) -> Iterator[list[bytes]]:
+    return (list(hashes[start : start + BATCH]) for start in range(0, len(hashes), BATCH))

@@ -77,7 +77,7 @@ class Collection(Base):
             idle = [bytes(h) for h, used in rows if used < before and bytes(h) not in live]
             if idle:
                 with self._database.write(upkeep=True) as connection:
-                    count += chunks.delete(connection, idle, before)
+                    count += len(chunks.delete(connection, idle, before))
             if len(rows) < PAGE * 10:
                 return count
             last = bytes(rows[-1].hash)

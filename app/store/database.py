@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import secrets
 import shutil
 import sqlite3
@@ -35,8 +36,12 @@ ROOM_BYTES = 2**20
 
 REPAIR = "stop the server, run `fleetmap verify`, and restore a backup of the database"
 _CORRUPT = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
-_CORRUPT_STATES = frozenset({"XX001", "XX002", "58P01"})
-"""PostgreSQL: data_corrupted, index_corrupted, undefined_file."""
+_CORRUPT_STATES = frozenset({"XX001", "XX002"})
+"""PostgreSQL: data_corrupted, index_corrupted."""
+
+_NO_FILE_STATE = "58P01"
+_RELATION_FILE = re.compile(r"\b(?:base|global|pg_tblspc)/")
+"""PostgreSQL's undefined_file means damage only for a file of its data, not for a missing library."""
 
 _DISK_FULL_STATE = "53100"
 
@@ -130,6 +135,7 @@ class Database:
         self.file = Path(name) if name and name != ":memory:" and not name.startswith("file:") else None
         self._inode: int | None = None
         self._damage: tuple[float, str] | None = None
+        self._checking = threading.Lock()
         self._gone = ""
         self._readonly = readonly
         # SQLite lets whoever happens to look at the right moment write: among many, one may never come to it.
@@ -197,13 +203,16 @@ class Database:
         if self._damage is None:
             return
         since, detail = self._damage
-        if time.monotonic() - since > RECHECK_SECONDS:
-            problem = self.integrity(1) if self.sqlite else None
-            if problem is None:
-                self._damage = None
-                log.warning("database: no damage is found any more")
-                return
-            self._damage = time.monotonic(), detail
+        if time.monotonic() - since > RECHECK_SECONDS and self._checking.acquire(blocking=False):
+            try:  # one check at a time; all others report what is known
+                problem = self.integrity(1) if self.sqlite else None
+                if problem is None:
+                    self._damage = None
+                    log.warning("database: no damage is found any more")
+                    return
+                self._damage = time.monotonic(), detail
+            finally:
+                self._checking.release()
         raise DatabaseDamaged(detail)
 
     def check_room(self) -> None:
@@ -227,6 +236,11 @@ class Database:
         except DatabaseDamaged as error:
             return error.detail
         return None if lines == ["ok"] else "; ".join(map(str, lines))
+
+    def note_damage_of(self, error: DatabaseDamaged) -> None:
+        """Report damage that another process met. A file that is missing is checked anew for each request."""
+        if not isinstance(error, _FileGone):
+            self.note_damage(error.detail)
 
     def note_damage(self, detail: str) -> None:
         """Report damage that was found: from now on ``check`` fails."""
@@ -277,7 +291,8 @@ class Database:
         original = getattr(error, "orig", None)
         code = getattr(original, "sqlite_errorcode", 0) & 0xFF
         state = getattr(original, "sqlstate", None)
-        if code in _CORRUPT or state in _CORRUPT_STATES or "Could not decode to UTF-8" in str(original):
+        lost = state == _NO_FILE_STATE and _RELATION_FILE.search(str(original)) is not None
+        if code in _CORRUPT or state in _CORRUPT_STATES or lost or "Could not decode to UTF-8" in str(original):
             self.report_damage(_short(error))
             return DatabaseDamaged(self._damage[1] if self._damage else "")
         full = code == sqlite3.SQLITE_FULL or state == _DISK_FULL_STATE

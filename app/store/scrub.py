@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
-from app.errors import FleetMapError
+from app.errors import FleetMapError, Unavailable, reason_of
 from app.store.store import Store
 from app.store.verify import KINDS, Kind, check_root
 
@@ -76,6 +76,7 @@ class Scrub:
         self._state = ScrubState()
         self._saved = 0.0
         self._debt = 0.0
+        self._reason = ""
         self._thread = threading.Thread(target=self._run, daemon=True, name="fleetmap-scrub")
 
     def start(self) -> None:
@@ -96,12 +97,22 @@ class Scrub:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     while not self._stopped.is_set():
                         self.pass_if_due()
+                        self._reason = ""
                         self._stopped.wait(POLL_SECONDS)
             except BlockingIOError:
                 pass  # another process is at it
-            except (OSError, FleetMapError) as error:
-                log.warning("scrub: waits (reason=%s)", error)
+            except OSError as error:
+                self._wait_for(reason_of(error))
+            except FleetMapError as error:
+                self._wait_for(error.detail)
+            except Exception:  # the thread must outlive a defect: else nothing is checked any more, unnoticed
+                log.exception("scrub: internal error; it goes on")
             self._stopped.wait(POLL_SECONDS)
+
+    def _wait_for(self, reason: str) -> None:
+        if reason != self._reason:  # once, not every minute
+            log.warning("scrub: waits (reason=%s)", reason)
+        self._reason = reason
 
     def pass_if_due(self) -> None:
         """Go on with a pass, or begin one where the last is long enough ago."""
@@ -112,8 +123,16 @@ class Scrub:
             kept = (self._state.completed, self._state.findings)
             self._state = ScrubState(started=time.time(), completed=kept[0], findings=kept[1])
         steps = (self._pages, self._chunks, self._versions, self._blobs, self._cache)
+        restarting: dict[Callable[[], None], Kind] = {
+            self._pages: "database",
+            self._versions: "version",
+            self._cache: "cache",
+        }
         while self._state.step < len(steps):
-            steps[self._state.step]()
+            step = steps[self._state.step]
+            if step in restarting:
+                self._state.found.pop(restarting[step], None)  # what it found before it was stopped is found again
+            step()
             if self._stopped.is_set():
                 self._save()
                 return
@@ -140,9 +159,13 @@ class Scrub:
                 return
 
     def _blobs(self) -> None:
-        for name, size, problem in self._store.blobs.checked(self._state.after):
+        for name, size, problem in self._store.blobs.checked(self._state.after, self._skip):
             if not self._checked("blob", name, size, problem):
                 return
+
+    def _skip(self, name: str, error: Unavailable) -> None:
+        """Pass over a file that cannot be read at the moment: the next pass checks it."""
+        log.warning("scrub: a stored file could not be checked (blob=%s, reason=%s)", name, error.detail)
 
     def _cache(self) -> None:
         for key, size, intact in self._check_cache():

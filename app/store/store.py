@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from sqlalchemy import select
 
-from app.errors import Damaged
+from app.errors import Damaged, DatabaseDamaged
 from app.store import schema, tables
 from app.store.audit import Audit, record
 from app.store.base import environment_row
 from app.store.blobs import Blobs
 from app.store.channels import Channels
-from app.store.chunks import Chunks, delete, insert
+from app.store.chunks import Chunks, delete, insert, problem, select_rows
 from app.store.collect import Collection
 from app.store.content import Content
 from app.store.database import Database
@@ -31,7 +30,7 @@ from app.store.robots import Robots
 from app.store.tokens import Tokens
 from app.store.tree import Draft
 from app.store.values import Version
-from app.store.verify import Finding, Progress, Verifier
+from app.store.verify import Progress, Verified, Verifier
 from app.store.versions import Versions
 
 ABANDONED_SECONDS = 24 * 3600.0
@@ -88,9 +87,9 @@ class Store(
         self.blobs.check()
         self._database.check_room()
 
-    def note_damage(self, detail: str) -> None:
+    def note_damage(self, error: DatabaseDamaged) -> None:
         """Report that another process found the database damaged: from now on ``check`` fails."""
-        self._database.note_damage(detail)
+        self._database.note_damage_of(error)
 
     def verifier(self, progress: Progress = lambda kind, size: None) -> Verifier:
         """Checks of everything that is stored."""
@@ -126,12 +125,15 @@ class Store(
         with self._database.write() as connection:
             insert(connection, {name: compress(raw) for name, raw in chunks.items()})
 
-    def remove_unused_chunks(self, findings: Iterable[Finding]) -> set[str]:
-        """Remove damaged chunks that no version has; their hashes. For when all others were healed."""
-        names = {f.name for f in findings if f.kind == "chunk" and not f.versions}
+    def remove_unused_chunks(self, found: Verified) -> set[str]:
+        """Remove damaged chunks that no version has; their hashes. For when all others were healed.
+
+        A check takes minutes: a chunk that was used or healed since it started stays.
+        """
+        names = [bytes.fromhex(f.name) for f in found.findings if f.kind == "chunk" and not f.versions]
         with self._database.write() as connection:
-            delete(connection, map(bytes.fromhex, names), int(time.time()) + 1)
-        return names
+            damaged = [name for name, data in select_rows(connection, names) if problem(name, data) is not None]
+            return {name.hex() for name in delete(connection, damaged, int(found.started))}
 
     def recover(self) -> None:
         """At start: remove what a killed upload left behind. Safe beside other processes that are at work."""

@@ -6,6 +6,7 @@ where all chunks have their hashes and none is missing, every version is what it
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
@@ -52,11 +53,12 @@ class Finding:
 
 @dataclass(slots=True)
 class Verified:
-    """What was checked (count by kind), and what was found."""
+    """What was checked (count by kind), and what was found. started: when, in seconds since 1970."""
 
     checked: dict[Kind, int] = field(default_factory=dict)
     size: int = 0
     findings: list[Finding] = field(default_factory=list)
+    started: float = field(default_factory=time.time)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,11 +8,14 @@ import os
 import sqlite3
 import subprocess
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import httpx
 import pytest
 
+from app.api.services import Writability
+from app.errors import NoRoom
 from tests.api import samples
 from tests.api.conftest import Api, problem, running, settings_for
 
@@ -188,6 +191,35 @@ def test_a_missing_or_replaced_database_file_takes_no_writes(tmp_path: Path) -> 
 # --- full and read-only disks ---
 
 
+def test_the_disk_is_probed_once_for_many_requests() -> None:
+    probes: list[int] = []
+    full = False
+
+    def probe() -> None:
+        probes.append(1)
+        if full:
+            raise NoRoom("the disk is full")
+
+    writability = Writability(probe)
+    with ThreadPoolExecutor(8) as many:
+        assert set(many.map(lambda _: writability.refusal(), range(50))) == {None}
+    assert len(probes) < 25, "few, however slowly they come"
+    full = True
+    writability.forget()
+    assert writability.refusal() == "the disk is full"
+
+
+def test_readiness_probes_the_disk_now_and_then(own: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    api, probes = own[0], list[int]()
+    monkeypatch.setattr("app.api.services.WRITABLE_SECONDS", 3600.0)
+    monkeypatch.setattr("app.api.uploads.check_room", lambda _: probes.append(1))
+    api.app.state.services.writability.forget()
+    for _ in range(5):
+        assert api.get("/readyz?for=writes").json()["writes"] == "ok"
+    assert len(probes) == 1
+    api.app.state.services.writability.forget()
+
+
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     with mounted_disk(tmp_path / "disk") as folder:
@@ -244,6 +276,7 @@ def test_a_full_disk_stops_writes_alone(small_disk: Path) -> None:
             assert answer.status_code == 507, answer.text
             assert int(answer.headers["retry-after"]) > 0
             assert api.get(f"/maps/{farm}/tmap2").status_code == 200
+            api.app.state.services.writability.forget()
             ready = api.get("/readyz").json()
             assert ready["status"] == "read-only"
             assert ready["reads"] == "ok"
@@ -254,5 +287,6 @@ def test_a_full_disk_stops_writes_alone(small_disk: Path) -> None:
                 ballast.unlink()
                 api.upload(farm, {NETWORK: samples.tmap2().replace(b"0.1", b"0.3")}, 201)
                 api.get(f"/maps/{farm}/kml")
+                api.app.state.services.writability.forget()
                 ready = api.get("/readyz?for=writes").json()
                 assert (ready["status"], ready["writes"], ready["cache"]) == ("ready", "ok", "ok")

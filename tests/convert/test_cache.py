@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -229,3 +230,52 @@ def test_check_hashes_every_entry_and_removes_the_damaged_ones(tmp_path: Path) -
         key("a"): (5, True), key("b"): (0, False), key("c"): (5, True)
     }  # fmt: skip
     assert cache.stored_keys() == sorted([key("a"), key("c")])
+
+
+def refusing(monkeypatch: pytest.MonkeyPatch, name: str, number: int) -> None:
+    """Let reading files of this name fail."""
+    real = Path.open
+
+    def refuse(path: Path, mode: str = "r", **more: Any) -> Any:
+        if path.name == name and "r" in mode:
+            raise OSError(number, os.strerror(number), str(path))
+        return real(path, mode, **more)
+
+    monkeypatch.setattr(Path, "open", refuse)
+
+
+@pytest.mark.parametrize("name", ["map.json", "0"])
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.EACCES, errno.ESTALE, errno.EIO, errno.EBADMSG])
+def test_only_damage_removes_an_entry_that_cannot_be_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str, number: int
+) -> None:
+    Cache(tmp_path, 10**6).get_or_make(key("a"), product)
+    cache, damaged = Cache(tmp_path, 10**6), number in {errno.EIO, errno.EBADMSG}
+    refusing(monkeypatch, name, number)
+    assert cache.get(key("a")) is None
+    assert damaged or cache.check(key("a")) == (0, True)
+    monkeypatch.undo()
+    assert cache.damaged == damaged
+    assert (cache.get(key("a")) is None) == damaged
+    assert str(tmp_path) not in caplog.text
+
+
+def test_an_entry_that_is_removed_at_once_is_no_problem_of_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = Cache(tmp_path, 10**6)
+    refusing(monkeypatch, "map.json", errno.ENOENT)
+    made = cache.get_or_make(key("a"), product)
+    assert (made.files[0].read(), cache.problem) == (b"hello", None)
+
+
+@pytest.mark.parametrize("error", [shutil.Error("/srv/data/cache/0"), OSError("/srv/data is odd"), PermissionError(13)])
+def test_problem_of_the_disk_names_no_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: OSError) -> None:
+    def refuse(*_: object) -> None:
+        raise error
+
+    cache = Cache(tmp_path, 10**6)
+    monkeypatch.setattr(caching, "_write", refuse)
+    assert cache.get_or_make(key("a"), product).files[0].read() == b"hello"
+    assert cache.problem
+    assert "/srv" not in cache.problem

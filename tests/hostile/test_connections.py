@@ -130,8 +130,8 @@ def test_limit_of_open_files_is_raised_as_far_as_it_may_be() -> None:
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (min(1024, hard), before[1]))
         assert fit_open_files(1000) == 1000
-        assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] >= 1000
-        assert fit_open_files(hard + 1) < hard
+        assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] >= 2000, "a socket and a streamed file each"
+        assert fit_open_files(hard + 1) <= hard // 2
         assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] == hard
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import random
@@ -11,6 +12,7 @@ import sys
 import time
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -312,3 +314,28 @@ def test_chunks_are_named_by_their_canonical_bytes(store: Store):
         rows = connection.exec_driver_sql("SELECT hash, data FROM chunk").all()
     assert len(rows) > 20
     assert all(digest(decompress(bytes(data))) == bytes(name) for name, data in rows)
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.EBADMSG, errno.EUCLEAN, errno.EMFILE, errno.EACCES])
+def test_only_broken_storage_makes_a_blob_damaged(
+    sqlite_store: Store, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    name = sqlite_store.blobs.put(b"large" * 20_000)
+    real = Path.open
+
+    def refuse(path: Path, mode: str = "r", **more: Any) -> Any:
+        if path.name == name and "r" in mode:
+            raise OSError(number, os.strerror(number), str(path))
+        return real(path, mode, **more)
+
+    monkeypatch.setattr(Path, "open", refuse)
+    broken = number not in {errno.EMFILE, errno.EACCES}
+    for read in (sqlite_store.blobs.open, sqlite_store.blobs.get):
+        with pytest.raises(Damaged if broken else Unavailable, match=os.strerror(number)) as caught:
+            read(name)
+        assert str(sqlite_store.blob_dir) not in caught.value.detail
+    if broken:
+        assert sqlite_store.blobs.verify() == [name]
+    else:
+        with pytest.raises(Unavailable, match=os.strerror(number)):
+            sqlite_store.blobs.verify()

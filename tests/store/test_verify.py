@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import pickle
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy import exc
 
 from app.errors import Damaged, DatabaseDamaged, NoRoom, Unavailable
+from app.store.blobs import _unreadable
 from app.store.changes import Changes
+from app.store.chunks import insert
+from app.store.encode import compress, digest
 from app.store.scrub import LOCK, Scrub, figures, read_state
 from app.store.store import Store
 from app.store.values import Source
@@ -122,6 +130,59 @@ def test_the_scrub_finds_damage_goes_on_after_a_stop_and_tells_its_age(store: St
     assert read_state(store.blob_dir) == state, "the next pass is not due yet"
 
 
+def test_a_scrub_that_is_stopped_again_and_again_counts_once(
+    sqlite_store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sqlite_store, "check_pages", lambda: "a page is bad")
+    for stopped in (True, True, True, False):
+        scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9)
+        if stopped:
+            scrub._stopped.set()
+        scrub.pass_if_due()
+    assert read_state(sqlite_store.blob_dir).findings == {"database": 1}
+
+
+def test_a_scrub_passes_over_what_cannot_be_read(
+    sqlite_store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = sorted(sqlite_store.blobs.put(bytes([k]) * 100) for k in range(3))
+    real = sqlite_store.blobs._problem
+
+    def problem(name: str, row: Any) -> str | None:
+        if name == names[0]:
+            raise _unreadable(PermissionError(errno.EACCES, "refused", "/srv/data"))
+        return "damaged" if name == names[1] else real(name, row)
+
+    monkeypatch.setattr(sqlite_store.blobs, "_problem", problem)
+    Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9).pass_if_due()
+    assert read_state(sqlite_store.blob_dir).findings == {"blob": 1}
+    assert "Permission denied" in caplog.text
+    assert "/srv" not in caplog.text
+
+
+def test_a_scrub_survives_a_defect(
+    sqlite_store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("app.store.scrub.POLL_SECONDS", 0.01)
+    errors = [ValueError("a defect"), *[OSError(errno.EIO, "refused", "/srv/data")] * 2]
+
+    def check_pages() -> None:
+        if errors:
+            raise errors.pop(0)
+
+    monkeypatch.setattr(sqlite_store, "check_pages", check_pages)
+    scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9, delay=0.0)
+    scrub.start()
+    deadline = time.monotonic() + 30
+    while not read_state(sqlite_store.blob_dir).completed:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    scrub.close()
+    assert "a defect" in caplog.text
+    assert caplog.text.count("Input/output error") == 1
+    assert "/srv" not in caplog.text
+
+
 def test_one_process_scrubs(sqlite_store: Store) -> None:
     scrubs = [Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9, delay=0.0) for _ in range(2)]
     for scrub in scrubs:
@@ -200,3 +261,73 @@ def test_errors_of_postgresql_have_their_meaning(sqlite_store: Store, state: str
     if kind is DatabaseDamaged:
         with pytest.raises(DatabaseDamaged, match="fleetmap verify"):
             sqlite_store.check()
+
+
+def test_a_missing_library_of_postgresql_is_no_damage(sqlite_store: Store) -> None:
+    class Refused(Exception):
+        sqlstate = "58P01"
+
+    library = 'could not access file "$libdir/postgis-3": No such file or directory'
+    with pytest.raises(Unavailable, match="postgis-3") as caught, sqlite_store._database.read():
+        raise exc.OperationalError("SELECT 1", {}, Refused(library))
+    assert not isinstance(caught.value, DatabaseDamaged)
+    sqlite_store.check()
+
+
+def test_a_file_that_a_worker_missed_is_no_lasting_damage(sqlite_store: Store) -> None:
+    file = Path(sqlite_store.database_url.removeprefix("sqlite:///"))
+    away = file.rename(file.with_suffix(".away"))
+    with pytest.raises(DatabaseDamaged, match="missing") as caught:
+        sqlite_store.environments()
+    sqlite_store.note_damage(pickle.loads(pickle.dumps(caught.value)))
+    away.rename(file)
+    sqlite_store.check()
+    sqlite_store.note_damage(DatabaseDamaged("a page is bad"))
+    with pytest.raises(DatabaseDamaged, match="a page is bad"):
+        sqlite_store.check()
+
+
+def test_one_check_of_the_pages_at_a_time(sqlite_store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    database, release, checks = sqlite_store._database, threading.Event(), list[int]()
+
+    def integrity(limit: int) -> str:
+        checks.append(limit)
+        assert release.wait(30)
+        return "a page is bad"
+
+    monkeypatch.setattr(database, "integrity", integrity)
+    database._damage = time.monotonic() - 100, "the database is damaged"
+
+    def check() -> None:
+        with pytest.raises(DatabaseDamaged, match="the database is damaged"):
+            database.check()
+
+    with ThreadPoolExecutor(1) as first:
+        running = first.submit(check)
+        while not checks:
+            time.sleep(0.01)
+        for _ in range(5):
+            check()
+        release.set()
+        running.result(30)
+    check()
+    assert len(checks) == 1
+    database._damage = time.monotonic() - 100, "the database is damaged"
+    monkeypatch.setattr(database, "integrity", lambda limit: None)
+    database.check()
+    database.check()
+
+
+def test_only_chunks_that_are_still_damaged_and_unused_are_removed(store: Store) -> None:
+    raws = {digest(raw).hex(): raw for raw in (b"healed" * 50, b"in use" * 50, b"unused" * 50)}
+    healed, in_use, unused = raws
+    with store._database.write() as connection:
+        insert(connection, dict.fromkeys(raws, b"damaged"), now=time.time() - 100)
+    found = store.verifier().run()
+    assert {f.name for f in found.findings} == set(raws)
+    with store._database.write() as connection:  # uploads of other processes, while the check goes on
+        insert(connection, {healed: compress(raws[healed])}, now=time.time() - 50)
+        insert(connection, {in_use: b"damaged"})
+    assert store.remove_unused_chunks(found) == {unused}
+    assert store.chunk(healed) == raws[healed]
+    assert {f.name for f in store.verifier().run().findings} == {in_use}
