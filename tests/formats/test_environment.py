@@ -484,6 +484,10 @@ def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> N
     for wrong in ({"shape": [-1, 2]}, {"shape": [2**40, 2**20]}, {"type": "|O"}, {"file": "../x"}):
         parts_ = [p | {"cells": array | wrong} if p["layer"] == "occupancy" else p for p in top["parts"]]
         damaged.append({**top, "parts": parts_})
+    files_of = next(part for part in top["parts"] if part["layer"] == "resources")["files"]
+    for name in ("../../evil.stl", "/etc/evil.stl", "a\\b", "a\nb", ""):
+        named = {"files": {name: files_of["a/b.bin"]}}
+        damaged.append({**top, "parts": [p | named if p["layer"] == "resources" else p for p in top["parts"]]})
     for wrong in (b"{", b"[]" * 10**5, *map(orjson.dumps, damaged)):
         with pytest.raises(BadUpload) as caught:
             told({**files, content: wrong})
