@@ -93,14 +93,16 @@ def report_overlay(env: EnvironmentPath, body: OverlayBody, here: Here, who: Rep
     now = datetime.now(UTC)
     crs = None if body.polygon is None else body.crs or ("wgs84" if head.datum else "local")
     level = body.level or GROUND
+    edge = None
     if body.edge is not None:
-        level = overlays.edge_of(here.store, versions, body.edge)[0].level
+        key, feature = overlays.edge_of(here.store, versions, body.edge)
+        level, edge = key.level, feature.id
     reported = Overlay(
         environment=env,
         kind=body.kind,
         level=level,
         polygon=None if body.polygon is None else _polygon(body.polygon),
-        edge=body.edge,
+        edge=edge,
         crs=crs,
         detail=body.detail,
         reporter=who.robot or who.name,

@@ -9,6 +9,7 @@ from typing import Any
 import shapely
 
 from app.errors import Invalid, Problem
+from app.model import bends
 from app.model.closures import zone_id
 from app.model.features import Feature
 from app.model.layers import PartKey
@@ -35,17 +36,24 @@ def permanent_edits(store: Store, head: Version, overlay: Overlay) -> list[dict[
 
 
 def edge_of(store: Store, versions: Iterable[Version], edge: str) -> tuple[PartKey, Feature]:
-    """Find an edge and its network in the first of these versions that has it. Raises Invalid if none has."""
+    """Find an edge and its network in the first of these versions that has it. Raises Invalid if none has.
+
+    A piece of a bent edge, as formats with straight edges name it, is found as that edge if no edge has its own name.
+    """
     numbers = []
     environment = ""
+    piece = bends.NAMED.match(edge)
+    names = [(edge, 0)] if piece is None else [(edge, 0), (piece[1], int(piece[2]))]
     for version in versions:
         environment = version.environment
         numbers.append(str(version.number))
-        for entry in version.parts:
-            if entry.key.layer == "topology":
-                for found in store.get(version, entry.key, [edge]):
-                    if found.properties.get("kind") == "edge":
-                        return entry.key, found
+        for name, number in names:
+            for entry in version.parts:
+                if entry.key.layer == "topology":
+                    for found in store.get(version, entry.key, [name]):
+                        pieces = shapely.get_num_coordinates(found.geometry) - 1
+                        if found.properties.get("kind") == "edge" and (not number or number <= pieces > 1):
+                            return entry.key, found
     raise Invalid(
         f"{environment} has no edge {edge[:80]!r} in version {' or '.join(numbers)}: use an edge's id, as "
         "GET …/layers/topology lists it",

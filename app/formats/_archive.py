@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import re
 import stat
 import struct
 import unicodedata
@@ -18,7 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from app.errors import Problem, TooLarge, UnreadableFile, UnsafeArchive
-from app.formats import Limits
+from app.formats import UNPACKED_FREE_BYTES, Limits
 from app.model.names import bad_name
 
 _END = struct.Struct("<4s4H2LH")
@@ -41,6 +42,13 @@ _TEXTS = (".kml", ".xml", ".osm", ".sdf", ".world", ".dae", ".yaml", ".yml", ".j
 _TEXT_COST = 2
 """What parsing a text costs beside keeping other content: it must compress by this factor less. Real ones reach 40."""
 _IMAGES = (".pgm", ".ppm", ".pnm", ".pbm", ".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
+_ARRAY = re.compile(r"(?:.*/)?config/fleet_map/[0-9]+\.bin")
+"""The cells and voxels of an environment package: as large as images, and as uniform."""
+
+_LIMITS = Limits()
+_DENSE_RATIO = 40
+"""How far written content may be compressed beyond the free bytes: less than half of what ``unpack`` accepts."""
+
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
@@ -95,7 +103,7 @@ def _check_sizes(entries: list[_Entry], packed: int, limits: Limits) -> None:
 
     ``_deflated`` counts what really comes out and stops at the declared size.
     """
-    images = [e for e in entries if e.name.lower().endswith(_IMAGES)]
+    images = [e for e in entries if _is_image(e.name)]
     for e in entries:
         if e.name.lower().endswith(_TEXTS):
             bound = min(limits.text_bytes, limits.max_unpacked(e.packed // _TEXT_COST))
@@ -114,6 +122,10 @@ def _check_sizes(entries: list[_Entry], packed: int, limits: Limits) -> None:
             raise _too_large(declared, bound, ratio, what=f" of {what}")
 
 
+def _is_image(name: str) -> bool:
+    return name.lower().endswith(_IMAGES) or _ARRAY.fullmatch(name) is not None
+
+
 def _too_large(size: int, bound: int, limit: str, where: str | None = None, what: str = "") -> TooLarge:
     place = f"{where}: " if where else ""
     reason = f"declares {size} bytes{what}; {limit} is {bound}"
@@ -123,10 +135,11 @@ def _too_large(size: int, bound: int, limit: str, where: str | None = None, what
 def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:
     """A ZIP archive of the files: the entry ``first`` leads, the others follow by name; equal files, equal bytes.
 
-    Time stamps and permissions are constants; a file that deflating does not shrink is stored. Raises ValueError for
-    a name that ``unpack`` would refuse.
+    Time stamps and permissions are constants; a file that deflating does not shrink is stored, and one that it
+    shrinks further than ``unpack`` accepts. Raises ValueError for a name that ``unpack`` would refuse.
     """
     out = io.BytesIO()
+    free = {True: _LIMITS.pixels // 2, False: UNPACKED_FREE_BYTES // 2}
     with zipfile.ZipFile(out, "w") as archive:
         for name in sorted(files, key=lambda n: (n != first, n)):
             reason = bad_name(name)
@@ -136,8 +149,12 @@ def pack(files: Mapping[str, bytes], first: str | None = None) -> bytes:
             info.create_system = 3
             info.external_attr = (stat.S_IFREG | 0o644) << 16
             body = files[name]
-            shrinks = len(zlib.compress(body, 6)) < len(body)
-            info.compress_type = zipfile.ZIP_DEFLATED if shrinks else zipfile.ZIP_STORED
+            packed, is_image = len(zlib.compress(body, 6)), _is_image(name)
+            deflate = packed < len(body)
+            if len(body) > _DENSE_RATIO * packed:
+                deflate = len(body) <= free[is_image]
+                free[is_image] -= len(body) if deflate else 0
+            info.compress_type = zipfile.ZIP_DEFLATED if deflate else zipfile.ZIP_STORED
             archive.writestr(info, body, compresslevel=6)
     return out.getvalue()
 

@@ -30,7 +30,8 @@ class Number:
     """A finite number from ``low`` to ``high``, also one in quotes; outside of ``usual`` it is doubtful.
 
     above: the number must be larger than ``low``. hint: what a doubtful number may mean instead. or_other: values of
-    other types are the reader's business.
+    other types are the reader's business. doubtful: nothing is refused, what would be is doubtful (keys that users may
+    have given a meaning of their own).
     """
 
     low: float = -MAX_METRES
@@ -40,9 +41,14 @@ class Number:
     hint: str = ""
     unit: str = ""
     or_other: bool = False
+    doubtful: bool = False
 
     def check(self, value: Any) -> tuple[str, str]:
         """Return why the value is refused, and why it is doubtful; empty texts if it is not."""
+        refusal, doubt = self._check(value)
+        return ("", refusal or doubt) if self.doubtful else (refusal, doubt)
+
+    def _check(self, value: Any) -> tuple[str, str]:
         number = _number(value)
         unit = f" {self.unit}" if self.unit else ""
         if number is None and self.or_other:
@@ -134,6 +140,7 @@ LATITUDE = Number(-90.0, 90.0, unit="degrees")
 LONGITUDE = Number(-180.0, 180.0, unit="degrees")
 COORDINATE = Number(unit="metres")
 LENGTH = Number(0.0, MAX_METRES, above=True, unit="metres")
+WIDTH = Number(0.0, MAX_METRES, usual=(1e-6, MAX_METRES), hint="there is no room in it", unit="metres")
 NOT_NEGATIVE = Number(0.0, MAX_METRES)
 SPEED = Number(0.0, 1000.0, usual=(0.0, 50.0), hint="is it in metres per second?", unit="m/s")
 ANGLE_USUAL = 6.3

@@ -31,7 +31,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 from urllib.parse import quote
 
@@ -462,28 +462,33 @@ def read_kml(
     return reader.layers(), reader.used
 
 
-_TURN = Number(-360.0, 360.0, unit="degrees")
-_SIZE = Number(0.0, MAX_METRES)
+_ANGLE = Number(-360.0, 360.0, unit="degrees")
+_TURN = replace(_ANGLE, doubtful=True)
+_SIZE = Number(0.0, MAX_METRES, doubtful=True)
 _FLAG = Words(("0", "1", "true", "false"))
 _VALUES: Mapping[str, Number | Words] = {
-    **dict.fromkeys(("rotation", "heading", "tilt", "roll"), _TURN),
+    "rotation": _ANGLE,
+    **dict.fromkeys(("heading", "tilt", "roll"), _TURN),
     **dict.fromkeys(("leftFov", "rightFov", "bottomFov", "topFov"), _TURN),
     "latitude": LATITUDE,
     "longitude": LONGITUDE,
-    **dict.fromkeys(("altitude", "minAltitude", "maxAltitude", "near"), COORDINATE),
+    **dict.fromkeys(("altitude", "minAltitude", "maxAltitude", "near"), replace(COORDINATE, doubtful=True)),
     **dict.fromkeys(("width", "scale", "refreshInterval", "viewRefreshTime", "viewBoundScale"), _SIZE),
-    "range": Number(0.0, 1e9, unit="metres"),
+    "range": Number(0.0, 1e9, unit="metres", doubtful=True),
     **dict.fromkeys(("open", "visibility", "extrude", "tessellate", "fill", "outline"), _FLAG),
     "altitudeMode": Words(
         ("clampToGround", "relativeToGround", "absolute", "clampToSeaFloor", "relativeToSeaFloor"),
     ),
 }
-"""Plain values of KML, by element. Source: OGC KML 2.3, Google's gx extension."""
+"""Plain values of KML, by element: places are refused if they are out of range, views and styles are doubtful.
+
+Source: OGC KML 2.3, Google's gx extension.
+"""
 
 
 def _check_values(root: etree._Element, context: ReadContext) -> None:
-    """Refuse values that are out of range, with the line; report unknown words."""
-    doubts: dict[str, tuple[int | None, int]] = {}
+    """Refuse places that are out of range, with the line; report doubtful values, once for each element."""
+    doubts: dict[str, list[Any]] = {}
     for name, rule in _VALUES.items():
         for element in root.iter("{*}" + name):
             text = (element.text or "").strip()
@@ -493,15 +498,17 @@ def _check_values(root: etree._Element, context: ReadContext) -> None:
             if refusal:
                 raise UnreadableFile(f"<{name}>: {refusal}", [Problem(refusal, line=element.sourceline, where=name)])
             if doubt:
-                line, count = doubts.get(f"<{name}>: {doubt}", (element.sourceline, 0))
-                doubts[f"<{name}>: {doubt}"] = (line, count + 1)
+                doubts.setdefault(name, [doubt, element.sourceline, 0])[2] += 1
     for box in root.iter("{*}LatLonBox", "{*}LatLonAltBox"):
         north, south = child_text(box, "north"), child_text(box, "south")
         if _PLAIN_NUMBER.match(north) and _PLAIN_NUMBER.match(south) and float(north) < float(south):
             reason = f"north {north} is south of south {south}"
-            raise UnreadableFile(f"<{local_name(box)}>: {reason}", [_at(reason, box.sourceline)])
-    for reason, (line, count) in doubts.items():
-        context.warn(reason if count == 1 else f"{reason} ({count} times)", line=line)
+            if local_name(box) == "LatLonBox":
+                raise UnreadableFile(f"<LatLonBox>: {reason}", [_at(reason, box.sourceline)])
+            doubts.setdefault("LatLonAltBox", [reason, box.sourceline, 0])[2] += 1
+    for name, (doubt, line, count) in doubts.items():
+        more = "" if count == 1 else f" ({count} times)"
+        context.warn(f"<{name}>: {doubt}{more}", line=line, where=name)
 
 
 class _Reader:

@@ -22,7 +22,7 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, ReadContext, WriteContext, _fields, _yaml, all_formats
-from app.formats._fields import ANY, COORDINATE, LENGTH, NOT_NEGATIVE, POINT, SPEED, Number, Quaternion, Text, record
+from app.formats._fields import ANY, COORDINATE, NOT_NEGATIVE, POINT, SPEED, WIDTH, Number, Quaternion, Text, record
 from app.formats._text import METRES, encoded, numbers
 from app.model.features import Features, Properties, from_columns, points, unique_ids
 from app.model.frame import GROUND
@@ -91,7 +91,14 @@ TRANSFORMATION = {
 }
 
 _YAW = Number(0.0, 1e4, usual=(0.0, 10.0), hint="is it in radians?", unit="rad")
-_FREE = record(is_open=True, speed_limit=SPEED, width=LENGTH, xy_goal_tolerance=NOT_NEGATIVE, yaw_goal_tolerance=_YAW)
+_FREE = record(
+    is_open=True,
+    is_loose=True,
+    speed_limit=replace(SPEED, doubtful=True),
+    width=replace(WIDTH, doubtful=True),
+    xy_goal_tolerance=NOT_NEGATIVE,
+    yaw_goal_tolerance=_YAW,
+)
 _EDGE = record(
     "action action_type config edge_id fail_policy fluid_navigation node recovery_behaviours_config map_2d",
     goal=record(target_pose=record(is_open=True, pose=ANY)),
@@ -459,7 +466,7 @@ def _lift(said: dict[str, Any], rest: dict[str, Any]) -> None:
     lifted = {
         key: value
         for key, value in own.items()
-        if (key in NUMERIC_WORDS and isinstance(value, (int, float)) and not isinstance(value, bool))
+        if (key in NUMERIC_WORDS and isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0)
         or (key == "name" and isinstance(value, str) and value not in ("", said.get("name")))
         or (isinstance(value, dict) and key in _families() and key != NAME)
     }

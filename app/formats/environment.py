@@ -21,12 +21,24 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from app.errors import CannotConvert, FleetMapError, MissingLayer, Problem, UnreadableFile
-from app.formats import Files, Format, Inner, Needs, ReadContext, WriteContext, _archive, _content, _shell, register
+from app.formats import (
+    Files,
+    Format,
+    Inner,
+    Limits,
+    Needs,
+    ReadContext,
+    WriteContext,
+    _archive,
+    _content,
+    _shell,
+    register,
+)
 from app.formats._network import some
 from app.model.features import Features
 from app.model.frame import GROUND, Level
@@ -118,7 +130,11 @@ class _Writer:
         self.left_over()
         self.scripts(variables)
         if self.context.stored is not None and not self.complete:  # else the maps say something else
-            self.out |= _content.pack(self.layers, self.out, self.context.stored)
+            content = _content.pack(self.layers, self.out, self.context.stored)
+            if len(content[_content.MAIN]) <= Limits().text_bytes:
+                self.out |= content
+            else:
+                self.context.warn("the stored layers are too large to be in it exactly: it holds the maps only")
         return {f"{CONFIG}/{path}": data for path, data in self.out.items()}
 
     # --- one map ---
@@ -133,21 +149,31 @@ class _Writer:
             self.context.warn(f"no {name} is in it: {error.detail}")
         return None
 
-    def put(self, names: Mapping[str, str], inner: Inner, *, copy: bool = False) -> None:
-        """Take in a map's files. names: its name of a file -> path here. copy: another map tells the same, so that
-        what this one lost is no loss."""
-        for name, data in inner.files.items():
-            path = names[name]
-            if path in self.out and self.out[path] != data:
-                raise CannotConvert(f"two maps of the environment would both be {CONFIG}/{path}: rename one of them")
-            self.out[path] = data
-        main = f"{CONFIG}/{names[next(iter(inner.files))]}"
+    def put(self, names: Mapping[str, str], inner: Inner, *, copy: bool = False) -> str:
+        """Add a map's files and return the path of its main file, with a number where another map has that path.
+
+        Args:
+            names: path in the package by the map's own name of a file.
+            copy: whether another map has the same content: what this one drops is no loss.
+        """
+        first = next(iter(inner.files))
+        names = {**names, first: self.free_path(names[first], inner.files[first])}
+        self.out |= {names[name]: data for name, data in inner.files.items()}
+        main = f"{CONFIG}/{names[first]}"
         if not copy:
             self.context.dropped += [{**line, "what": f"{main}: {line['what']}"} for line in inner.dropped]
             self.context.template += [{**line, "what": f"{main}: {line['what']}"} for line in inner.template]
         for problem in inner.warnings:
             path_ = names.get(problem.file or "")
             self.context.warnings.append(dataclasses.replace(problem, file=f"{CONFIG}/{path_}" if path_ else main))
+        return names[first]
+
+    def free_path(self, path: str, data: bytes) -> str:
+        """A path that no other content has, also where upper and lower case are the same."""
+        if self.out.get(path) == data:
+            return path
+        end = _ending(path)
+        return _distinct(path.removesuffix(end), end, {other.casefold() for other in self.out})
 
     def only(self, *layers: Layer) -> Layers:
         """The stored parts of these layers."""
@@ -279,8 +305,7 @@ class _Writer:
             main, *others = inner.files
             path = f"world/{_world_name(name)}"
             paths = {n: f"world/custom_models/{n.removeprefix('models/')}" for n in others}
-            self.put({main: path, **paths}, inner)
-            first.append(path)
+            first.append(self.put({main: path, **paths}, inner))
             if others:
                 self.paths["GAZEBO_CUSTOM_MODELS"] = "world/custom_models/"
         if first:
@@ -299,18 +324,17 @@ class _Writer:
                 continue
             self.told.add(key)
             path = "world/poi.tmap2.yaml" if key.level == GROUND else f"world/poi_{_plain(key.level)}.tmap2.yaml"
-            self.put(dict.fromkeys(inner.files, path), inner)
-            self.paths.setdefault("POI_FILE", path)
+            self.paths.setdefault("POI_FILE", self.put(dict.fromkeys(inner.files, path), inner))
 
     def objects(self) -> None:
-        """Objects by the format they came from; those of no format, and zones, in one that says where they belong."""
+        """Objects by the format they came from; zones, GeoJSON's and those of no format in one GeoJSON file."""
         rest: dict[PartKey, Part] = {k: p for k, p in self.only("zones").parts.items() if isinstance(p, Features)}
         families: dict[str, dict[PartKey, Part]] = {}
         for key, part in self.layers.vector("objects").items():
             if len(part) and key not in self.told:
                 families.setdefault(key.name, {})[key] = part
         for family, parts in families.items():
-            inner = self.family(family, parts)
+            inner = self.family(family, parts) if family != "geojson" else None
             if inner is None:
                 rest |= parts
                 continue
@@ -363,14 +387,10 @@ class _Writer:
 
     def stem(self, key: PartKey, all_keys: set[PartKey]) -> str:
         """A part's name as a folder's: on the ground its own, elsewhere with its level; never two alike."""
-        mine = {k: _plain(k.name if k.level == GROUND else f"{k.name}_{k.level}") for k in sorted(all_keys)}
-        taken: set[str] = set()
-        for k, name in mine.items():
-            new, number = name, 2
-            while new in taken:
-                new, number = f"{name}_{number}", number + 1
-            taken.add(new)
-            mine[k] = new
+        mine: dict[PartKey, str] = {}
+        for k in sorted(all_keys):
+            name = _plain(k.name if k.level == GROUND else f"{k.name}_{k.level}")
+            mine[k] = _distinct(name, "", {other.casefold() for other in mine.values()})
         return mine[key]
 
     # --- the scripts ---
@@ -440,6 +460,14 @@ def _plain(name: str) -> str:
     return plain or "unnamed"
 
 
+def _distinct(stem: str, end: str, taken: Container[str]) -> str:
+    """``stem`` with its ending, with the first number from 2 on where that is taken. taken: case-folded."""
+    path, number = f"{stem}{end}", 2
+    while path.casefold() in taken:
+        path, number = f"{stem}_{number}{end}", number + 1
+    return path
+
+
 def _world_name(name: str) -> str:
     """What a world's file is called: as it was, with an ending that says what it is."""
     stem = _plain(name.rpartition("/")[2])
@@ -466,7 +494,7 @@ register(
         write_options=WriteOptions,
         family=NAME,
         rank=70,
-        version=2,
+        version=3,
         extensions=(".zip",),
         holds=True,
     )

@@ -21,7 +21,7 @@ import numpy as np
 
 from app.errors import Problem, UnreadableFile
 from app.formats import Files, Format, Needs, ReadContext, WriteContext, _fields, _yaml, register
-from app.formats._fields import COORDINATE, LENGTH, record
+from app.formats._fields import COORDINATE, WIDTH, record
 from app.formats._network import (
     Array,
     checked_name,
@@ -53,7 +53,7 @@ AXES = ("x", "y", "z")
 _END = record(x=COORDINATE, y=COORDINATE)
 SHAPE = record(
     internal_points=[record("name", x=COORDINATE, y=COORDINATE, z=COORDINATE)],
-    network_lines=[record("name", start=_END, end=_END, width=LENGTH)],
+    network_lines=[record("name", start=_END, end=_END, width=WIDTH)],
 )
 """What the file holds."""
 

@@ -43,7 +43,7 @@ from app.formats import (
     _yaml,
     register,
 )
-from app.formats._fields import ANGLE, ANY, COORDINATE, LENGTH, SPEED, Number, Words, record
+from app.formats._fields import ANGLE, ANY, COORDINATE, SPEED, WIDTH, Number, Words, record
 from app.formats._network import own
 from app.formats._rmf import (
     BUILDING,
@@ -92,7 +92,7 @@ SHAPE = record(
     "building_name",
     levels=record(each=record(vertices=[(COORDINATE, COORDINATE, _VERTEX)], lanes=[(ANY, ANY, _LANE)])),
     doors=record(each=record("map", endpoints=[[COORDINATE]])),
-    lifts=record(each=record(position=(COORDINATE, COORDINATE, ANGLE), dims=[LENGTH])),
+    lifts=record(each=record(position=(COORDINATE, COORDINATE, ANGLE), dims=[WIDTH])),
 )
 """What a graph holds. Source: rmf_building_map_tools (building_map/generate_nav), rmf_fleet_adapter's parse_graph."""
 

@@ -28,7 +28,7 @@ from app.model.network import middle_frame
 TOLERANCE_METRES = 0.05
 """Maximum distance of a straight edge from the bent one, in metres: vertices that matter less are no bends."""
 
-IDENTITY = frozenset({"id", "edge_id", "index", "line", "backward", "geometry"})
+IDENTITY = frozenset({"id", "edge_id", "index", "lane", "line", "backward", "geometry"})
 """Words by which formats identify one edge of a file, or its place in it: pieces of an edge do not have them."""
 
 NAMED = re.compile(r"(.+)~([1-9][0-9]{0,5})\Z", re.DOTALL)

@@ -12,6 +12,7 @@ from app.model.frame import GROUND, Datum, Level, is_writable
 from app.model.geodesy import LocalFrame, local_frame
 from app.model.grid import OccupancyGrid
 from app.model.imagery import Picture
+from app.model.names import bad_name
 from app.model.voxels import VoxelMap
 
 Layer = Literal["location", "objects", "topology", "occupancy", "voxels", "imagery", "zones", "resources"]
@@ -42,6 +43,11 @@ class Resources:
     """Files that belong to a part's items, by relative path with forward slashes."""
 
     files: Mapping[str, bytes]
+
+    def __post_init__(self) -> None:
+        for path in self.files:
+            if reason := bad_name(path):
+                raise Invalid(f"a resource cannot be called {path[:80]!r}: the name {reason}")
 
 
 Part = Features | OccupancyGrid | VoxelMap | Picture | Resources

@@ -16,7 +16,7 @@ def bad_name(name: str) -> str | None:
         return f"has not 1 to {MAX_NAME} characters"
     if "\\" in name:
         return "has a backslash"
-    if any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
+    if not name.isprintable() and any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") for c in name):
         return "has control characters"
     if name.startswith("/") or (len(name) > 1 and name[1] == ":"):
         return "is absolute"

@@ -125,6 +125,25 @@ def test_edge_that_only_a_channel_has_can_be_closed(api: Api, farm: str) -> None
     assert "version 4" in problem["detail"]
 
 
+def test_piece_of_a_bent_edge_closes_the_edge(api: Api, farm: str) -> None:
+    """A robot reports the edge as its map calls it, and straight edges lead from bend to bend there."""
+    url = f"environments/{farm}/overlays"
+    line = edge(api, farm, "gate_barn")
+    (x, y, *_), (x2, y2, *_) = line["place"]["coordinates"]
+    line["place"]["coordinates"] = [[x, y], [(x + x2) / 2, y + 3], [x2, y2]]
+    feature = {word: line[word] for word in ("type", "id", "geometry", "place", "properties")}
+    put = {"op": "put", "layer": "topology", "feature": feature}
+    api.post(f"environments/{farm}/edits", {"changes": [put]})
+    assert "gate_barn~2" in api.get(f"/maps/{farm}/tmap2").text
+    made = api.post(url, {"kind": "blocked", "edge": "gate_barn~2", "state": "accepted"}).json()
+    assert made["edge"] == "gate_barn"
+    assert "gate_barn" not in api.get(f"/maps/{farm}/tmap2").text
+    api.post(f"{url}/{made['id']}/end", expect=200)
+    for name in ("gate_barn~3", "barn_gate~1", "gate~1"):
+        problem = api.problem("POST", url, 422, json={"kind": "blocked", "edge": name})
+        assert f"no edge '{name}'" in problem["detail"]
+
+
 @pytest.mark.parametrize("what", [{"edge": "gate_barn"}, {"polygon": SQUARE, "crs": "local"}])
 def test_kept_overlay_is_a_version_and_stays_in_force(api: Api, farm: str, what: dict[str, Any]) -> None:
     url = f"environments/{farm}/overlays"

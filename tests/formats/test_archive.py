@@ -250,3 +250,24 @@ BUILDERS: list[Callable[[], bytes]] = [lambda: b"", lambda: b"PK", lambda: b"PK\
 def test_what_is_no_archive_is_unreadable(build: Callable[[], bytes]):
     with pytest.raises(UnreadableFile):
         _archive.unpack(build(), Limits())
+
+
+def test_what_is_packed_is_accepted_however_uniform_it_is(monkeypatch: pytest.MonkeyPatch):
+    array, text = "config/fleet_map/0.bin", "config/fleet_map/content.json"
+    packed = _archive.pack({array: bytes(20_000_000)})
+    assert len(packed) < 100_000
+    assert len(_archive.unpack(packed, Limits())[array]) == 20_000_000
+    with pytest.raises(TooLarge):
+        _archive.unpack(zipped(("elsewhere/0.bin", bytes(20_000_000))), Limits())
+    for files in (
+        {text: b'{"kind":"wall"},' * 1_200_000},
+        {f"{k}.osm": bytes(6_000_000) for k in range(4)},
+        {array: bytes(9_000_000), text: bytes(9_000_000), "map.dae": bytes(9_000_000)},
+    ):
+        assert _archive.unpack(_archive.pack(files), Limits()) == files
+    few = Limits(pixels=2**20)
+    monkeypatch.setattr(_archive, "_LIMITS", few)
+    grids = {f"{k}.pgm": bytes(400_000) for k in range(4)}
+    packed = _archive.pack(grids)
+    assert _archive.unpack(packed, few) == grids
+    assert len(packed) < 1_300_000

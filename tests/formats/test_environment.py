@@ -294,6 +294,46 @@ def test_objects_stand_in_the_format_they_came_from() -> None:
         assert (part.local == other.local).all()
 
 
+def test_maps_that_would_have_one_path_get_paths_of_their_own() -> None:
+    def wall(name: str) -> Features:
+        return features([(name, shapely.LineString([(0, 0), (5, 0)]), {"kind": "wall", "name": name})], "local")
+
+    poi = features([("p", shapely.Point(1, 1), {"kind": "poi", "name": "p"})], "local")
+    poi_2 = features([("p", shapely.Point(2, 1), {"kind": "poi", "name": "p"})], "local")
+    parts: dict[PartKey, Part] = {
+        PartKey("objects", "ground", "geojson"): wall("a"),
+        PartKey("objects", "ground", "made by hand"): wall("b"),
+        PartKey("zones", "ground", "zones"): features([("z", shapely.box(0, 0, 1, 1), {"kind": "keepout"})], "local"),
+        PartKey("objects", "Über 1", "tmap2"): poi,
+        PartKey("objects", "Ober 1", "tmap2"): poi_2,
+        PartKey("objects", "ober 1", "tmap2"): poi_2,
+        PartKey("occupancy", "ground", "Hall"): grid(),
+        PartKey("occupancy", "ground", "hall"): grid(100),
+    }
+    levels = tuple(Level(name) for name in ("ground", "Über 1", "Ober 1", "ober 1"))
+    inner, _ = written(Layers(parts, DATUM, levels))
+    names = {n.removeprefix("config/") for n in maps_of(inner)}
+    assert {"world/objects.geojson", "metric/Hall/map.yaml", "metric/hall_2/map.yaml"} <= names
+    assert len({n.casefold() for n in names if "/poi_" in n}) == 3
+    maps = told(maps_of(inner))
+    drawn = {k: p for k, p in parts.items() if k.layer == "zones" or k.name in ("geojson", "made by hand")}
+    assert {k: p.ids for k in drawn if isinstance(p := maps.parts[k], Features)} == {
+        k: p.ids for k, p in drawn.items() if isinstance(p, Features)
+    }
+    assert hashes(told({"a.zip": _archive.pack(inner)}).parts) == hashes(parts)
+
+
+def test_worlds_of_one_name_get_files_of_their_own() -> None:
+    def world(name: str, size: int) -> bytes:
+        shape = f"<geometry><box><size>{size} 1 1</size></box></geometry>"
+        link = f"<link name='l'><collision name='c'>{shape}</collision></link>"
+        return f"<sdf version='1.6'><world name='{name}'><model name='m'>{link}</model></world></sdf>".encode()
+
+    both = told({"a/yard.world": world("a/yard", 1), "b/yard.world": world("b/yard", 2)})
+    inner, _ = written(both.layers(DATUM))
+    assert {"config/world/yard.world.xml", "config/world/yard_2.world.xml"} <= inner.keys()
+
+
 def test_pictures_and_clouds_have_their_places() -> None:
     samples = Path(__file__).resolve().parents[1] / "samples"
     paths = [samples / "satellite/orchard.tif", samples / "pcd/shelf.pcd", samples / "octomap/shed.bt"]
@@ -444,6 +484,10 @@ def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> N
     for wrong in ({"shape": [-1, 2]}, {"shape": [2**40, 2**20]}, {"type": "|O"}, {"file": "../x"}):
         parts_ = [p | {"cells": array | wrong} if p["layer"] == "occupancy" else p for p in top["parts"]]
         damaged.append({**top, "parts": parts_})
+    files_of = next(part for part in top["parts"] if part["layer"] == "resources")["files"]
+    for name in ("../../evil.stl", "/etc/evil.stl", "a\\b", "a\nb", ""):
+        named = {"files": {name: files_of["a/b.bin"]}}
+        damaged.append({**top, "parts": [p | named if p["layer"] == "resources" else p for p in top["parts"]]})
     for wrong in (b"{", b"[]" * 10**5, *map(orjson.dumps, damaged)):
         with pytest.raises(BadUpload) as caught:
             told({**files, content: wrong})
