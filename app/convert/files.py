@@ -62,6 +62,8 @@ def _offline(
     asked = dict(options)
     recipes.own_options(known, asked)
     needed: frozenset[Layer] = known.carries | known.needs.also.union(*known.needs.one_of)
+    if "topology" in known.carries:
+        needed |= {"occupancy"}  # edges may lead through what it shows
     wanted = None if "objects" in needed else needed  # whatever can be read can be an object
     if site.asks_for_all(known, asked):
         wanted = None  # further parts may be derived from any layer

@@ -232,8 +232,7 @@ def _written(known: Format, made: Layers, options: Any, source: _Source, notes: 
 
 def crossing_edges(known: Format, written: Layers, around: Layers) -> list[Problem]:
     """Warn of edges that lead through obstacles in a map of these layers. around: layers with grids and objects."""
-    straight, _ = formats.straightened(known, written)
-    return crossings(straight, around, straight=known.bends != "shape")
+    return crossings(written, around, shape_of=known.name if known.bends == "foreign" else None)
 
 
 def _lacks_edges(known: Format, layers: Layers) -> bool:
@@ -260,9 +259,13 @@ def from_layers(
     origin: Mapping[PartKey, tuple[tuple[str, ...], str]] | None = None,
     credit: Mapping[PartKey, Sequence[str]] | None = None,
     closures: Closures | None = None,
+    around: Layers | None = None,
     title: str = UNTITLED,
 ) -> Written:
-    """A map by the cheapest way that works on these layers. Raises what planning, deriving and writing raise."""
+    """A map by the cheapest way that works on these layers. Raises what planning, deriving and writing raise.
+
+    around: the layers in which edges may meet obstacles, if there are more than these.
+    """
     if site.asks_for_all(known, asked):
         return _every_part(known, layers, asked, derived=derived, entries=entries, origin=origin, credit=credit)
     own = recipes.own_options(known, asked)
@@ -276,8 +279,9 @@ def from_layers(
             raise recipes.exhausted(error, failed) from error
         kept = Layers({k: layers.parts[k] for k in way.keys}, layers.datum, layers.levels)
         try:
+            beside = around or layers
             written = write(
-                known, kept, asked, way, entries, origin, credit, closures=closures, around=layers, title=title
+                known, kept, asked, way, entries, origin, credit, closures=closures, around=beside, title=title
             )
             warnings = [*recipes.detours(failed), *written.report["warnings"]]
             return replace(written, report={**written.report, "warnings": warnings})
@@ -367,6 +371,7 @@ def _inner(
         origin=source.origin,
         credit=source.credit,
         closures=source.closures,
+        around=source.layers,
         title=source.title,
     )
     report = made.report

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from app.errors import FleetMapError, Invalid, MissingDatum, Problem
 from app.model import masks
+from app.model.bends import is_identified
 from app.model.features import Features, Properties
-from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.grid import OCCUPIED, UNKNOWN, OccupancyGrid, as_seen
 from app.model.layers import MAP, Layers, PartKey
 from app.model.obstacles import footprint_of
 from app.model.solids import Solids
@@ -28,6 +29,9 @@ CLEARANCE_METRES = 2.0
 MIN_CROSSING_METRES = 0.1
 """Minimum length of an edge inside a ground plan, in metres."""
 
+END_METRES = 1e-6
+"""Maximum distance of an edge's end from the way inside a ground plan that begins or ends there, in metres."""
+
 MAX_EDGES, MAX_BODIES = 500_000, 50_000
 """What is checked of one level: more would slow a map down."""
 
@@ -37,13 +41,13 @@ SAMPLES, MAX_SAMPLES = 2**20, 2**25
 LISTED = 5
 
 
-def crossings(networks: Layers, around: Layers, *, straight: bool) -> list[Problem]:
-    """Warn of edges that cross occupied cells of their level's grid or, if it has no grid, a building or a wall.
+def crossings(networks: Layers, around: Layers, *, shape_of: str | None = None) -> list[Problem]:
+    """Warn of edges that cross occupied cells of their level's grid, or buildings and walls where it knows nothing.
 
     Args:
-        networks: the network as it is written.
+        networks: the network as it is stored, before bent edges are split.
         around: the grids and objects that are in memory.
-        straight: robots drive straight from node to node, whatever an edge's shape.
+        shape_of: a format with shapes that its consumers ignore: robots drive straight along edges that it identifies.
 
     Networks on earth are not checked while there is no datum, or one that is far away.
     """
@@ -51,43 +55,57 @@ def crossings(networks: Layers, around: Layers, *, straight: bool) -> list[Probl
     for key, part in networks.vector("topology").items():
         grids = {k: g for k, g in around.grids().items() if k.level == key.level}
         grid_key = _obstacle_grid(grids)
-        bodies = _bodies(around, key.level) if grid_key is None else []
+        grid = None if grid_key is None else grids[grid_key]
+        bodies = _bodies(around, key.level)
         edges = [k for k, p in enumerate(part.properties) if p.get("kind") == "edge"][:MAX_EDGES]
-        if not edges or (grid_key is None and not bodies):
+        if not edges or (grid is None and not bodies):
             continue
         try:
             geometry = part.in_local(networks.frame)
         except (MissingDatum, Invalid):
             continue
-        segments, owner = _segments(part, geometry, edges, straight=straight)
-        if grid_key is not None:
-            hit, what = _in_grid(segments, grids[grid_key]), f"occupied cells of the occupancy grid {grid_key.name!r}"
-        else:
-            hit, what = _in_bodies(segments, bodies), "buildings or walls"
-        ids = [part.ids[edges[n]] for n in np.unique(owner[hit]).tolist()]
-        if ids:
-            count = "1 edge crosses" if len(ids) == 1 else f"{len(ids)} edges cross"
-            named = ", ".join(ids[:LISTED]) + (" …" if len(ids) > LISTED else "")
-            reason = f"{count} {what}: {named}; a robot that follows the network meets an obstacle there"
-            out.append(Problem(reason, where=f"topology {key.level}/{key.name}"))
+        lines = _courses(part, geometry, edges, shape_of)
+        blocked = np.zeros(len(edges), bool)
+        if grid is not None and grid_key is not None:
+            segments, owner = _segments(lines)
+            blocked[owner[_in_grid(segments, grid)[0]]] = True
+            name = f"occupied cells of the occupancy grid {grid_key.name!r}"
+            out += _problems([part.ids[edges[n]] for n in np.flatnonzero(blocked).tolist()], name, key)
+        hit = _in_bodies(lines, bodies, grid) & ~blocked
+        out += _problems([part.ids[edges[n]] for n in np.flatnonzero(hit).tolist()], "buildings or walls", key)
     return out
 
 
-def _segments(
-    part: Features, geometry: NDArray[np.object_], edges: Sequence[int], *, straight: bool
-) -> tuple[Array, NDArray[np.int64]]:
-    """The straight pieces of edges as float64 [n, 2, 2] in metres, and the place of each piece's edge in ``edges``."""
-    shapes = geometry[list(edges)]
-    if straight:
-        shapes = shapes.copy()
-        point = shapely.get_type_id(geometry) == 0
-        nodes = {i: g for i, g, is_point in zip(part.ids, geometry, point, strict=True) if is_point and not g.is_empty}
-        for n in np.flatnonzero(shapely.get_num_coordinates(shapes) > 2).tolist():
-            p = part.properties[edges[n]]
-            ends = [nodes.get(str(p.get(word))) for word in ("source", "target")]
-            if ends[0] is not None and ends[1] is not None:
-                shapes[n] = shapely.LineString([(end.x, end.y) for end in ends if end is not None])
-    at, owner = shapely.get_coordinates(shapes, return_index=True)
+def _problems(ids: Sequence[str], obstacles: str, key: PartKey) -> list[Problem]:
+    if not ids:
+        return []
+    count = "1 edge crosses" if len(ids) == 1 else f"{len(ids)} edges cross"
+    named = ", ".join(ids[:LISTED]) + (" …" if len(ids) > LISTED else "")
+    reason = f"{count} {obstacles}: {named}; a robot that follows the network meets an obstacle there"
+    return [Problem(reason, where=f"topology {key.level}/{key.name}")]
+
+
+def _courses(
+    part: Features, geometry: NDArray[np.object_], edges: Sequence[int], shape_of: str | None
+) -> NDArray[np.object_]:
+    """The lines that robots drive along edges, in metres."""
+    lines = geometry[list(edges)]
+    if shape_of is None:
+        return lines
+    lines = lines.copy()
+    point = shapely.get_type_id(geometry) == 0
+    nodes = {i: g for i, g, is_point in zip(part.ids, geometry, point, strict=True) if is_point and not g.is_empty}
+    for n in np.flatnonzero(shapely.get_num_coordinates(lines) > 2).tolist():
+        p = part.properties[edges[n]]
+        ends = [nodes.get(str(p.get(word))) for word in ("source", "target")]
+        if is_identified(p, shape_of) and ends[0] is not None and ends[1] is not None:
+            lines[n] = shapely.LineString([(end.x, end.y) for end in ends if end is not None])
+    return lines
+
+
+def _segments(lines: NDArray[np.object_]) -> tuple[Array, NDArray[np.int64]]:
+    """The straight pieces of lines as float64 [n, 2, 2], and the index of each piece's line."""
+    at, owner = shapely.get_coordinates(lines, return_index=True)
     same = owner[1:] == owner[:-1]
     return np.stack([at[:-1], at[1:]], axis=1)[same], owner[:-1][same].astype(np.int64)
 
@@ -98,12 +116,16 @@ def _obstacle_grid(grids: Mapping[PartKey, OccupancyGrid]) -> PartKey | None:
     return next((k for k in found if k.name == MAP), found[0] if len(found) == 1 else None)
 
 
-def _in_grid(segments: Array, grid: OccupancyGrid) -> NDArray[np.bool_]:
-    """Which pieces lead through an occupied cell, looked up twice a cell."""
+def _in_grid(segments: Array, grid: OccupancyGrid) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which pieces lead through an occupied cell, and which through an unknown one or beyond the grid.
+
+    They are looked up twice a cell.
+    """
+    grid = as_seen(grid)
     x, y, yaw = grid.origin
     cosine, sine = np.cos(yaw), np.sin(yaw)
     turned = (segments - np.array([x, y])) @ np.array([[cosine, -sine], [sine, cosine]])
-    hit = np.zeros(len(segments), bool)
+    hit, unseen = np.zeros(len(segments), bool), np.zeros(len(segments), bool)
     length = np.hypot(*(turned[:, 1] - turned[:, 0]).T)
     step = max(grid.resolution / 2, float(length.sum()) / MAX_SAMPLES)
     count = np.ceil(length / step).astype(np.int64) + 1
@@ -119,8 +141,10 @@ def _in_grid(segments: Array, grid: OccupancyGrid) -> NDArray[np.bool_]:
         cells = grid.cells[row[inside], column[inside]]  # not of the whole grid, which may have 300 million
         occupied = (cells >= grid.occupied_thresh * OCCUPIED) & (cells != UNKNOWN)
         hit[number[inside][occupied]] = True
+        unseen[number[~inside]] = True
+        unseen[number[inside][cells == UNKNOWN]] = True
         begin = end
-    return hit
+    return hit, unseen
 
 
 def _bodies(around: Layers, level: str) -> list[Any]:
@@ -144,16 +168,31 @@ def _bodies(around: Layers, level: str) -> list[Any]:
     return bodies
 
 
-def _in_bodies(segments: Array, bodies: Sequence[Any]) -> NDArray[np.bool_]:
-    """Which pieces lead through a ground plan, from outside to outside."""
-    hit = np.zeros(len(segments), bool)
-    grounds, pieces = np.array(bodies, object), shapely.linestrings(segments)
-    piece, ground = shapely.STRtree(grounds).query(pieces, predicate="crosses")
-    ends = shapely.points(segments.reshape(-1, 2)).reshape(-1, 2)[piece]
-    outside = ~shapely.intersects(ends, grounds[ground][:, None]).any(axis=1)
-    piece, ground = piece[outside], ground[outside]
-    inside = shapely.length(shapely.intersection(pieces[piece], grounds[ground]))
-    hit[piece[inside >= MIN_CROSSING_METRES]] = True
+def _in_bodies(lines: NDArray[np.object_], bodies: Sequence[Any], grid: OccupancyGrid | None) -> NDArray[np.bool_]:
+    """Which lines lead through a ground plan, but for the way from an end inside to the outside.
+
+    grid: of the obstacles: a way that it knows all along is not in a body's way.
+    """
+    hit = np.zeros(len(lines), bool)
+    if not bodies:
+        return hit
+    grounds = np.array(bodies, object)
+    owner, ground = shapely.STRtree(grounds).query(lines, predicate="crosses")
+    inside = shapely.line_merge(shapely.intersection(lines[owner], grounds[ground]))
+    parts, pair = shapely.get_parts(inside, return_index=True)
+    is_long = shapely.length(parts) >= MIN_CROSSING_METRES
+    parts, owner = parts[is_long], owner[pair[is_long]]
+    passing = np.ones(len(parts), bool)
+    for index in (0, -1):
+        ends = shapely.get_point(lines[owner], index)
+        passing &= ~(shapely.distance(parts, ends) <= END_METRES)
+    parts, owner = parts[passing], owner[passing]
+    if grid is not None:
+        segments, number = _segments(parts)
+        unknown = np.zeros(len(parts), bool)
+        unknown[number[_in_grid(segments, grid)[1]]] = True
+        owner = owner[unknown]
+    hit[owner] = True
     return hit
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
+from app.derive import Notes
 from app.derive._choice import named, one_each
 from app.errors import MissingLayer
 from app.model import masks
-from app.model.grid import OccupancyGrid
+from app.model.grid import OccupancyGrid, as_seen, unknown_grey
 from app.model.layers import MAP, Layers, PartKey
 
 
@@ -21,6 +25,23 @@ def chosen(layers: Layers, name: str | None, what: str) -> dict[PartKey, Occupan
     if not maps:
         raise MissingLayer(f"costmap filter masks alone tell no {what}: upload an occupancy grid of what stands there")
     return one_each(maps, MAP, "occupancy grid", "grid")
+
+
+def seen(grid: OccupancyGrid, name: str, notes: Notes) -> OccupancyGrid:
+    """The grid with free cells of unknown's grey as unknown, and a warning where there are such cells."""
+    grey = unknown_grey(grid)
+    if grey is not None:
+        notes.warn(grey_warning(grid, grey, name, "they are taken as unknown"))
+    return as_seen(grid)
+
+
+def grey_warning(grid: OccupancyGrid, grey: NDArray[np.bool_], name: str, effect: str) -> str:
+    """The warning of free cells of unknown's grey. effect: what happens to them."""
+    return (
+        f"{name} has {int(np.count_nonzero(grey))} cells of the grey 205, map_saver's unknown, which its "
+        f"free_thresh of {grid.free_thresh:g} calls free: {effect}; write "
+        "free_thresh: 0.196 where such cells mean unknown"
+    )
 
 
 def called(key: PartKey) -> str:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from app.derive import Notes, derives
 from app.derive._figures import MOST, Box, Disc, Found, Sizes, figures
-from app.derive._grids import called, chosen
+from app.derive._grids import called, chosen, seen
 from app.errors import CannotConvert, TooLarge
 from app.model.features import features
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -91,7 +91,7 @@ class Parameters:
     )
 
 
-@derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0)
+@derives(gives="objects", needs={"occupancy"}, parameters=Parameters, cost=60.0, version=2)
 def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """A grid's obstacles as objects: posts or trees, walls and furniture by their shapes, of the height of a context.
 
@@ -102,7 +102,7 @@ def occupancy_to_objects(layers: Layers, parameters: Parameters, notes: Notes) -
     parts: dict[PartKey, Part] = {}
     used: set[str] = set()
     for key, grid in chosen(layers, parameters.grid, "obstacles").items():
-        rows = _objects(grid, parameters, layers.elevation(key.level), notes, called(key))
+        rows = _objects(seen(grid, called(key), notes), parameters, layers.elevation(key.level), notes, called(key))
         used.update(row[2]["kind"] for row in rows)
         parts[PartKey("objects", key.level, NAME)] = features(rows, "local")
     for kind in sorted(used):

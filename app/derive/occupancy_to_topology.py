@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -19,10 +19,10 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes, derives
-from app.derive._grids import called, chosen
+from app.derive._grids import called, chosen, grey_warning
 from app.errors import CannotConvert, Invalid, Problem, TooLarge
 from app.model.features import Compact, Features, Properties, from_columns, points
-from app.model.grid import UNKNOWN, OccupancyGrid, unknown_grey
+from app.model.grid import OccupancyGrid, as_seen, unknown_grey
 from app.model.layers import NETWORK, Layers, Part, PartKey
 from app.parameters import parameter
 
@@ -167,16 +167,11 @@ def _without_unseen(grid: OccupancyGrid, parameters: Parameters, notes: Notes, c
     grey = unknown_grey(grid)
     if grey is None:
         return grid
-    count = f"{called} has {int(np.count_nonzero(grey))} cells of the grey 205, map_saver's unknown, which its "
-    fix = "write free_thresh: 0.196 where such cells mean unknown"
     if parameters.unknown_grey == "free":
-        notes.warn(f"{count}free_thresh of {grid.free_thresh:g} calls free: ways may lead where nobody has been; {fix}")
+        notes.warn(grey_warning(grid, grey, called, "ways may lead where nobody has been"))
         return grid
-    notes.warn(
-        f"{count}free_thresh of {grid.free_thresh:g} calls free: no edges lead there; unknown_grey=free takes them as "
-        f"free; {fix}"
-    )
-    return replace(grid, cells=np.where(grey, np.uint8(UNKNOWN), grid.cells))
+    notes.warn(grey_warning(grid, grey, called, "no edges lead there; unknown_grey=free takes them as free"))
+    return as_seen(grid)
 
 
 def _check(parameters: Parameters) -> None:

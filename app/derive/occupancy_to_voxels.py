@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import Notes, derives
+from app.derive._grids import called, seen
 from app.errors import CannotConvert, MissingLayer
 from app.model import masks
 from app.model.grid import UNKNOWN, OccupancyGrid
@@ -42,7 +43,7 @@ class Parameters:
     free: bool = parameter(True, "whether free cells become free voxels of the same height, or stay unknown")
 
 
-@derives(gives="voxels", needs={"occupancy"}, parameters=Parameters, cost=8.0)
+@derives(gives="voxels", needs={"occupancy"}, parameters=Parameters, cost=8.0, version=2)
 def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """The extrusion of a grid: each occupied cell as a column from the level's floor up, each free one as free space.
 
@@ -56,7 +57,8 @@ def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) ->
     for key in found:
         if key.level in mains and key.name != MAP:
             continue
-        made = _extruded(layers.grids()[key], parameters, layers.elevation(key.level), key.name)
+        grid = seen(layers.grids()[key], called(key), notes)
+        made = _extruded(grid, parameters, layers.elevation(key.level), key.name)
         if made is not None:
             parts[PartKey("voxels", key.level, key.name)] = made
             if not made.leaf_counts()["occupied"]:

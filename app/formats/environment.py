@@ -163,7 +163,10 @@ class _Writer:
         if not copy:
             self.context.dropped += [{**line, "what": f"{main}: {line['what']}"} for line in inner.dropped]
             self.context.template += [{**line, "what": f"{main}: {line['what']}"} for line in inner.template]
+        reported = {problem.problem for problem in self.context.warnings} if copy else ()
         for problem in inner.warnings:
+            if problem.problem in reported:
+                continue
             path_ = names.get(problem.file or "")
             self.context.warnings.append(dataclasses.replace(problem, file=f"{CONFIG}/{path_}" if path_ else main))
         return names[first]

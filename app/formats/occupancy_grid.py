@@ -16,8 +16,9 @@ import io
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -49,6 +50,7 @@ from app.model.grid import (
     UNKNOWN_GREY,
     Mode,
     OccupancyGrid,
+    as_seen,
     outline,
     packed_cells,
     unknown_grey,
@@ -388,9 +390,9 @@ def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
     key = choose(sorted(layers.grids()), options)[0]
     grid = layers.grids()[key]
     if options.resolution is not None and options.resolution != grid.resolution:
-        grid = without_unknown_grey(resampled(grid, options.resolution))
+        grid = _with_mask(grid, partial(resampled, resolution=options.resolution))
     if options.normalize:
-        grid = without_unknown_grey(normalized(grid))
+        grid = _with_mask(grid, normalized)
     stem = file_stem(key.name)
     grid, pixels, kind = _encoding(grid, options, context, stem + ".yaml")
     grid, pixels = _with_grey(grid, pixels)
@@ -458,6 +460,15 @@ def _encoding(
     if pixels is None:
         raise AssertionError("raw says every value")
     return grid, pixels, options.file_type or "pgm"
+
+
+def _with_mask(grid: OccupancyGrid, change: Callable[[OccupancyGrid], OccupancyGrid]) -> OccupancyGrid:
+    """A grid in other cells, whose free cells have unknown's grey if one of those that they show had it."""
+    out = without_unknown_grey(change(grid))
+    if unknown_grey(grid) is None:
+        return out
+    grey = (change(as_seen(grid)).cells == UNKNOWN) & (out.cells == FREE)
+    return replace(out, properties={**out.properties, UNKNOWN_GREY: packed_cells(grey)}) if grey.any() else out
 
 
 def _with_grey(grid: OccupancyGrid, pixels: Table) -> tuple[OccupancyGrid, Table]:
@@ -698,7 +709,7 @@ register(
         parts=Parts("occupancy", "grid", file_stem),
         check=_occupancy_grid_rules.check,
         rank=40,
-        version=3,
+        version=4,
         extensions=(*YAML_ENDS, *IMAGE_ENDS),
     )
 )

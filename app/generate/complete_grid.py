@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.derive import Notes
-from app.derive._grids import called, chosen
+from app.derive._grids import called, chosen, grey_warning
 from app.errors import CannotGenerate
 from app.generate import MAX_CELLS, Source, _evidence, _wfc, generates
 from app.generate._site import refused
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey
 from app.model.layers import Layers, Part, PartKey
 from app.parameters import parameter
 
@@ -58,7 +58,7 @@ class Options:
     )
 
 
-@generates({"occupancy"}, parameters=Options, needs={"occupancy"}, version=2)
+@generates({"occupancy"}, parameters=Options, needs={"occupancy"}, version=3)
 def complete_grid(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
     """A grid's unknown cells as far as they are sure: walls that go on straight, free cells between free ones.
 
@@ -83,7 +83,13 @@ def _completed(grid: OccupancyGrid, options: Options, source: Source, notes: Not
     if grid.cells.size > MAX_CELLS:
         raise CannotGenerate(f"{name} has {grid.cells.size} cells, the limit is {MAX_CELLS}")
     known = grid.cells != UNKNOWN
+    grey = unknown_grey(grid)
+    if grey is not None:
+        known &= ~grey
+        notes.warn(grey_warning(grid, grey, name, "nothing is learned from them, and they stay as they are"))
     wanted = _wanted(known, options.reach / grid.resolution)
+    if grey is not None:
+        wanted &= ~grey
     count = int(np.count_nonzero(wanted))
     if count > MOST:
         raise refused("reach", f"{name}: {count} cells would be filled in, the limit is {MOST}: give a smaller reach")

@@ -18,7 +18,7 @@ from app.errors import CannotGenerate, Problem
 from app.generate import Source, _cells, _wfc, generates
 from app.generate._cells import LOOKS, Look
 from app.generate._site import Site, SiteOptions, refused
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, as_seen
 from app.model.layers import Layers
 from app.parameters import parameter
 
@@ -120,6 +120,7 @@ class Options(SiteOptions):
     {"location", "objects", "occupancy", "topology", "imagery"},
     parameters=Options,
     also={"location", "occupancy"},
+    version=2,
 )
 def wave_function_collapse(given: Layers, options: Options, source: Source, notes: Notes) -> Layers:
     """Wave-function collapse: a place every window of which stands in a sample.
@@ -214,6 +215,7 @@ def _sample(given: Layers, options: Options, notes: Notes) -> tuple[U8, Bool, fl
 
 def binary(grid: OccupancyGrid) -> tuple[U8, Bool]:
     """A grid's cells as 0 and 100, by its threshold, and which of them are known."""
+    grid = as_seen(grid)
     known = grid.cells != UNKNOWN
     occupied = known & (grid.cells >= grid.occupied_thresh * OCCUPIED)
     return np.where(occupied, OCCUPIED, FREE).astype(np.uint8), known

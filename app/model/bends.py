@@ -81,7 +81,7 @@ def _bent(part: Features, nodes: Container[str], shape_of: str | None) -> NDArra
     places = np.flatnonzero(line & (shapely.get_num_coordinates(part.geometry) > 2))
     rows = ((k, part.properties[k]) for k in places.tolist())
     edges = [(k, p) for k, p in rows if _is_edge(p) and p["source"] in nodes and p["target"] in nodes]
-    return np.array([k for k, p in edges if not _is_identified(p, shape_of)], np.intp)
+    return np.array([k for k, p in edges if not is_identified(p, shape_of)], np.intp)
 
 
 def _is_edge(properties: Properties) -> bool:
@@ -89,7 +89,8 @@ def _is_edge(properties: Properties) -> bool:
     return properties.get("kind") == "edge" and all(isinstance(end, str) for end in ends)
 
 
-def _is_identified(properties: Properties, name: str | None) -> bool:
+def is_identified(properties: Properties, name: str | None) -> bool:
+    """Whether the edge has an id in this format's file."""
     known = properties.get(name) if name is not None else None
     return isinstance(known, Mapping) and known.get("id") is not None
 

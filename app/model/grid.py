@@ -120,6 +120,14 @@ def unknown_grey(grid: OccupancyGrid) -> NDArray[np.bool_] | None:
     return out if out.any() else None
 
 
+def as_seen(grid: OccupancyGrid) -> OccupancyGrid:
+    """The grid with its free cells of unknown's grey as unknown: for whatever takes free cells as known to be free."""
+    grey = unknown_grey(grid)
+    if grey is None:
+        return without_unknown_grey(grid)
+    return without_unknown_grey(replace(grid, cells=np.where(grey, np.uint8(UNKNOWN), grid.cells)))
+
+
 def without_unknown_grey(grid: OccupancyGrid, seen: NDArray[np.bool_] | None = None) -> OccupancyGrid:
     """The grid after people have said what these cells are (seen: bool [height, width]; None: all of them)."""
     if UNKNOWN_GREY not in grid.properties:

@@ -184,8 +184,12 @@ def _cabin(p: Properties, geometry: Any) -> Body | None:
     cabin = shapely.box(-x, -y, x, y)
     walls = shapely.difference(cabin.buffer(CABIN_WALL, join_style="mitre"), cabin)
     gaps = []
+    pose = _pose(p, geometry)
+    if pose is None:
+        return None
     for door in doors.values():
-        numbers = [door.get(word) for word in ("x", "y", "motion_axis_orientation", "width")] if door else []
+        words = ("x", "y", "motion_axis_orientation", "width") if isinstance(door, Mapping) else ()
+        numbers = [door.get(word) for word in words]
         if not numbers or not all(isinstance(v, (int, float)) and abs(v) <= MAX_METRES for v in numbers):
             return None
         along = float(numbers[3]) / 2
@@ -196,7 +200,7 @@ def _cabin(p: Properties, geometry: Any) -> Body | None:
     if not gaps:
         return None
     walls = shapely.difference(walls, shapely.union_all(gaps))
-    placed = shapely.transform(walls, lambda at: solids.placed(np.c_[at, np.zeros(len(at))], _pose(p, geometry))[:, :2])
+    placed = shapely.transform(walls, lambda at: solids.placed(np.c_[at, np.zeros(len(at))], pose)[:, :2])
     return Body(placed, 0.0, size[2] if len(size) > 2 and size[2] > 0 else math.inf)
 
 
@@ -205,9 +209,12 @@ def _flat(polygon: Any) -> Any:
     return np.column_stack([shapely.get_coordinates(polygon), np.zeros(shapely.get_num_coordinates(polygon))])
 
 
-def _pose(p: Properties, geometry: Any) -> tuple[float, ...]:
-    """An object's pose; where it has none, its point."""
-    return solids.pose_of(p) if p.get("pose") is not None else (*shapely.get_coordinates(geometry)[0], 0, 0, 0, 0)
+def _pose(p: Properties, geometry: Any) -> tuple[float, ...] | None:
+    """An object's pose; where it has none, its point; None where it has neither."""
+    if p.get("pose") is not None:
+        return solids.pose_of(p)
+    at = shapely.get_coordinates(geometry)
+    return (*at[0], 0, 0, 0, 0) if len(at) else None
 
 
 def _tags(p: Properties) -> Mapping[str, Any]:
@@ -251,7 +258,8 @@ def _area(geometry: Any, p: Properties, width: float) -> Any:
     size = size_of(p)
     if kind in (0, 4) and size is not None:
         x, y = size[0] / 2, size[1] / 2
-        return shapely.Polygon(solids.placed(_flat(shapely.box(-x, -y, x, y)), _pose(p, geometry))[:, :2])
+        pose = _pose(p, geometry)
+        return None if pose is None else shapely.Polygon(solids.placed(_flat(shapely.box(-x, -y, x, y)), pose)[:, :2])
     if kind in (3, 6):
         return shapely.make_valid(geometry)
     if kind == 7:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,11 @@ import yaml
 
 from app import formats
 from app.convert import make
+from app.convert.files import offline
 from app.model.closures import Closure, Closures
 from app.model.features import features
-from app.model.frame import GROUND
-from app.model.grid import FREE, OCCUPIED, OccupancyGrid
+from app.model.frame import GROUND, Datum
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, UNKNOWN_GREY, OccupancyGrid, packed_cells
 from app.model.layers import MAP, NETWORK, Layers, Part, PartKey
 from tests.api.conftest import Api
 
@@ -115,3 +117,64 @@ def test_reports_of_stored_maps_name_edges_through_obstacles(api: Api, fresh: An
     assert len(crossing(report)) == 1
     assert "a_b, b_a" in crossing(report)[0]
     assert crossing(api.get(f"environments/{env}/versions/1/reports/tmap2").json()) == []
+
+
+HOUSE = ("house", shapely.box(4, -2, 6, 4), {"kind": "building"})
+
+
+def detour(*between: tuple[float, float], inside: bool = False, **parts: Part) -> Layers:
+    """One edge from (0, 0) over these places to (10, 0), or to a node inside of ``HOUSE``."""
+    end = (5.0, 0.0) if inside else (10.0, 0.0)
+    rows: list[tuple[str, Any, dict[str, Any]]] = [
+        ("a", shapely.Point(0, 0), {"kind": "node"}),
+        ("b", shapely.Point(end), {"kind": "node"}),
+        ("e", shapely.LineString([(0, 0), *between, end]), {"kind": "edge", "source": "a", "target": "b"}),
+    ]
+    network: dict[PartKey, Part] = {TOPOLOGY: features(rows, "local")}
+    objects = {PartKey("objects", GROUND, MAP): features([HOUSE], "local")}
+    grids = {PartKey(k, GROUND, MAP): p for k, p in parts.items()}  # type: ignore[arg-type]
+    return Layers({**network, **objects, **grids}, Datum(48.0, 9.0))
+
+
+@pytest.mark.parametrize("name", ["tmap2", "geojson", "nav2_route"])
+def test_bends_inside_a_building_do_not_hide_that_an_edge_leads_through_it(name: str) -> None:
+    known = formats.get_format(name)
+    crossed = {
+        "straight": detour(),
+        "bend inside": detour((5, 1)),
+        "in, out and in": detour((5, 1), (5, 6), (4.5, 6), (4.5, 2), (2, 2), inside=True),
+    }
+    for called, layers in crossed.items():
+        (told,) = crossing(make.from_layers(known, layers, {}, derived=False).report)
+        assert told.startswith("1 edge crosses buildings or walls: e;"), called
+    clear = [detour(inside=True), detour((4.5, 1), inside=True), detour((3, 6), (8, 6))]
+    assert all(crossing(make.from_layers(known, layers, {}, derived=False).report) == [] for layers in clear)
+
+
+def test_buildings_count_where_a_grid_knows_nothing() -> None:
+    known = formats.get_format("tmap2")
+    free = OccupancyGrid(np.full((20, 40), FREE, np.uint8), 0.5, (-5.0, -5.0, 0.0))
+    unknown = OccupancyGrid(np.full((20, 40), UNKNOWN, np.uint8), 0.5, (-5.0, -5.0, 0.0))
+    beyond = OccupancyGrid(np.full((20, 20), FREE, np.uint8), 0.5, (-5.0, -5.0, 0.0))
+    grey = replace(free, free_thresh=0.25, properties={UNKNOWN_GREY: packed_cells(np.ones((20, 40), bool))})
+    for grid, count in ((free, 0), (unknown, 1), (beyond, 1), (grey, 1)):
+        told = crossing(make.from_layers(known, detour((5, 1), occupancy=grid), {}, derived=False).report)
+        assert len(told) == count
+
+
+def test_an_environment_package_warns_of_edges_through_obstacles() -> None:
+    known = formats.get_format("environment")
+    told = crossing(make.from_layers(known, detour((5, 1)), {}, derived=False).report)
+    assert len(told) == 1
+    assert "1 edge crosses buildings or walls: e;" in told[0]
+
+
+@pytest.mark.parametrize("name", ["nav2_route", "navgraph"])
+def test_files_of_a_network_and_a_grid_are_checked_without_a_server(name: str) -> None:
+    layers = site(False, occupancy=hall())
+    files: dict[str, bytes] = {}
+    for source in ("nav2_route", "occupancy_grid"):
+        files |= make.from_layers(formats.get_format(source), layers, {}, derived=False).files
+    told = crossing(offline(files, name, datum=Datum(48.0, 9.0)).report)
+    assert len(told) == 1
+    assert "occupied cells of the occupancy grid" in told[0]

@@ -22,6 +22,7 @@ from app.derive.objects_to_voxels import Parameters as VoxelParameters
 from app.derive.objects_to_voxels import objects_to_voxels
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer
 from app.formats import Limits
+from app.model import obstacles
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
 from app.model.grid import OccupancyGrid
@@ -592,3 +593,13 @@ def test_the_walls_of_robast_sim_are_on_its_ros_map(shared: Path) -> None:
     here = away[np.clip(y.astype(int), 0, measured.height - 1), np.clip(x.astype(int), 0, measured.width - 1)]
     assert (here <= 0.2).mean() > 0.8
     assert (here <= 0.5).mean() > 0.95
+
+
+@pytest.mark.parametrize("door", ["left", ["x", "y"], 7, None])
+def test_lifts_of_which_nothing_says_where_they_are_open_have_no_walls(door: Any) -> None:
+    lift = {"kind": "lift", "size": [2.0, 2.0], "openrmf": {"says": {"doors": {"d": door}}}}
+    assert obstacles.body_of(lift, shapely.Point(4, 4)) is None
+    good = {"x": 1.0, "y": 0.0, "motion_axis_orientation": 1.57, "width": 1.0}
+    lift["openrmf"] = {"says": {"doors": {"d": good}}}
+    assert obstacles.body_of(lift, shapely.Point(4, 4)) is not None
+    assert obstacles.body_of(lift, shapely.Point()) is None, "nothing says where it is"

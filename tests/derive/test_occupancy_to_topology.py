@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,24 @@ from scipy.spatial import cKDTree
 
 from app import derive, formats, parameters
 from app.bundle import Hints, Known, read
-from app.derive import Notes
+from app.derive import Notes, occupancy_to_voxels, voxels_to_occupancy
 from app.derive.occupancy_to_topology import Parameters, network, occupancy_to_topology
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingLayer, NotFound
 from app.formats import Limits, ReadContext, WriteContext
+from app.generate import Source, complete_grid
 from app.model.features import Features
-from app.model.frame import Level
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, unknown_grey, without_unknown_grey
-from app.model.layers import NETWORK, Layers, PartKey
+from app.model.frame import GROUND, Level
+from app.model.grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    UNKNOWN_GREY,
+    OccupancyGrid,
+    packed_cells,
+    unknown_grey,
+    without_unknown_grey,
+)
+from app.model.layers import MAP, NETWORK, Layers, PartKey
 
 METHODS = ("skeleton", "roadmap", "voronoi")
 FARM = "environment_template/riseholme_park_farm_strawberry_polytunnels/config"
@@ -546,3 +557,45 @@ def test_cells_that_people_draw_are_no_longer_doubtful() -> None:
     assert after is not None
     assert (after == before & ~drawn).all()
     assert without_unknown_grey(grid).properties == {}
+
+
+def test_no_part_of_the_server_takes_the_grey_of_unknown_for_seen() -> None:
+    cells, grey = np.full((120, 120), FREE, np.uint8), np.ones((120, 120), bool)
+    grey[30:90, 30:90] = False
+    cells[30:90, [30, 89]] = cells[[30, 89], 30:90] = OCCUPIED
+    cells[5:15, 5:15] = cells[55:58, 55:58] = UNKNOWN
+    key = PartKey("occupancy", GROUND, MAP)
+    properties = {UNKNOWN_GREY: packed_cells(grey & (cells == FREE))}
+    grid = OccupancyGrid(cells, 0.05, free_thresh=0.25, properties=properties)
+    layers = Layers({key: grid})
+    free = int((cells[30:90, 30:90] == FREE).sum())
+
+    notes = Notes()
+    tall = occupancy_to_voxels.Parameters(height=0.05, free=True)
+    voxels = occupancy_to_voxels.occupancy_to_voxels(layers, tall, notes)
+    ((_, back),) = (
+        voxels_to_occupancy.voxels_to_occupancy(voxels, voxels_to_occupancy.Parameters(), Notes()).grids().items()
+    )
+    assert back.counts()["free"] == free
+    assert "taken as unknown" in notes.warnings[0].problem
+
+    ((_, whole),) = (
+        complete_grid.complete_grid(layers, complete_grid.Options(confidence=0.0), Source(1, "complete_grid"), notes)
+        .grids()
+        .items()
+    )
+    assert (whole.cells[55:58, 55:58] != UNKNOWN).all()
+    assert (whole.cells[5:15, 5:15] == UNKNOWN).all(), "nothing near it was seen"
+    assert (whole.cells[grey & (cells == FREE)] == FREE).all()
+    assert "nothing is learned from them" in notes.warnings[-1].problem
+
+    known = formats.get_format("occupancy_grid")
+    for values in ({"resolution": 0.1}, {"resolution": 0.025}, {"normalize": True}):
+        turned = replace(grid, origin=(0.0, 0.0, 0.3)) if "normalize" in values else grid
+        context = WriteContext(options=formats.write_options(known, values))
+        written = formats.write(known, Layers({key: turned}), context)
+        ((_, again),) = formats.read(formats.group(written)[0][0], ReadContext()).grids().items()
+        left = unknown_grey(again)
+        assert left is not None
+        area = int(((again.cells == FREE) & ~left).sum()) * again.resolution**2
+        assert area == pytest.approx(free * 0.05**2, rel=0.1), values
