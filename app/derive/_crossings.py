@@ -199,4 +199,4 @@ def _in_bodies(lines: NDArray[np.object_], bodies: Sequence[Any], grid: Occupanc
 def _is_body(properties: Properties) -> bool:
     base = properties.get("base")
     raised = isinstance(base, (int, float)) and base >= CLEARANCE_METRES
-    return properties.get("kind") in BODIES and not raised
+    return str(properties.get("kind")) in BODIES and not raised
