@@ -512,7 +512,7 @@ def _move(
     if not which.any():
         return
     moved = part.take(which)
-    generic = {"region", "path", "poi", None}
+    generic = ("region", "path", "poi", None)
     properties = tuple({**p, "kind": kind} if p.get("kind") in generic else p for p in moved.properties)
     parts[to] = Features(moved.ids, moved.geometry, properties, moved.local, part.document)
     parts[key] = part.take(~which)

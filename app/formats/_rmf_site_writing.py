@@ -474,6 +474,7 @@ class _Writer:
         for kind, p, geometry, _ in self._items(floor):
             rest = self._rest(floor, p)
             lines = geometry.geom_type == "LineString" and len(geometry.coords) >= 2
+            point = geometry.geom_type == "Point" and not geometry.is_empty
             if kind in ("wall", "door") and lines:
                 said = {**mapping(rest.get("says"), kind), "anchors": self._stands(floor, p, geometry, kind)}
                 self._solid(kind, p, said)
@@ -483,9 +484,9 @@ class _Writer:
                 self._floors(floor, p, geometry, rest)
             elif kind == "measurement" and lines:
                 self._measurement(floor, p, geometry, rest)
-            elif kind == "fiducial" and geometry.geom_type == "Point":
+            elif kind == "fiducial" and point:
                 self._fiducial(floor, p, geometry, rest)
-            elif kind in ("model", "robot") and geometry.geom_type == "Point":
+            elif kind in ("model", "robot") and point:
                 self._model(floor, kind, p, geometry, rest)
             elif kind != "lift":
                 self.lost["objects that are no part of a site"] += 1

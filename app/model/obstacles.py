@@ -267,14 +267,14 @@ def _area(geometry: Any, p: Properties, width: float) -> Any:
         return shapely.union_all(bodies) if bodies else None
     if width <= 0:
         return None
-    caps = "round" if kind in (0, 4) else "square" if p.get("kind") in SQUARE else "flat"
+    caps = "round" if kind in (0, 4) else "square" if str(p.get("kind")) in SQUARE else "flat"
     return shapely.buffer(geometry, width / 2, cap_style=caps, join_style="mitre", mitre_limit=2.0)
 
 
 def heights_of(properties: Properties, geometry: Any) -> tuple[float, float]:
     """(base, top) of an extruded footprint in metres above the floor; the top is infinite where nothing says."""
     p = properties
-    if p.get("kind") in HOLES:
+    if str(p.get("kind")) in HOLES:
         return -math.inf, math.inf
     tags = _tags(p)
     base, top = _positive(p.get("base")), _positive(p.get("height"))

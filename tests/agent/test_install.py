@@ -65,9 +65,9 @@ def test_the_base_is_small() -> None:
     assert names(PROJECT["dependencies"]) == {
         "typer", "rich", "httpx", "eclipse-zenoh", "cryptography", "backports-zstd",
     }  # fmt: skip
-    assert {"fastapi", "sqlalchemy", "scipy", "opencv-python-headless", "numpy"} <= names(
-        PROJECT["optional-dependencies"]["server"]
-    )
+    extras = PROJECT["optional-dependencies"]
+    assert {"numpy", "shapely", "lxml"} <= names(extras["convert"])
+    assert {"fleet-map-server", "fastapi", "sqlalchemy", "scipy", "opencv-python-headless"} <= names(extras["server"])
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["agent", "--help"], ["promote", "--help"]])
@@ -155,7 +155,7 @@ def test_the_server_code_is_imported_after_a_check_of_the_python() -> None:
     assert count >= 8
 
 
-AFTER_THE_CHECK = {"_compile", "_store", "_main", "bundle"}
+AFTER_THE_CHECK = {"_compile", "_store", "_main", "_companions", "_check_names", "_open", "_repair", "_donor", "bundle"}
 """Called by a function that has checked."""
 
 

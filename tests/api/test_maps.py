@@ -82,7 +82,7 @@ def test_repeated_requests_are_answered_from_memory(api: Api, farm: str, monkeyp
         raise Unavailable("the database is away")
 
     path = f"/maps/{farm}/tmap2"
-    first = api.get(path)
+    api.get(path)
     time.sleep(1.1)
     first = api.get(path)
     monkeypatch.setattr(Store, "standing", away)
@@ -90,7 +90,7 @@ def test_repeated_requests_are_answered_from_memory(api: Api, farm: str, monkeyp
     for _ in range(5):
         again = api.get(path)
         assert again.content == first.content
-        assert dict(again.headers).keys() == dict(first.headers).keys()
+        assert {*again.headers, "x-request-id"} == set(first.headers)  # only what the log may name has an id
         api.get(path, 304, headers={"If-None-Match": first.headers["etag"]})
     time.sleep(1.1)
     api.problem("GET", path, 503)

@@ -104,11 +104,12 @@ def aisles(scale: float) -> Layers:
 
 
 FINE = {"resolution": RESOLUTION}
+DRAWN = {**FINE, "padding": 0.0, "outside_free": True}
 CASES = {
     case.name: case
     for case in (
-        Case("objects → grid", walls, "objects_to_occupancy", {**FINE, "padding": 0.0}),
-        Case("objects → grid, inflated", walls, "objects_to_occupancy", {**FINE, "padding": 0.0, "inflate": 0.3}),
+        Case("objects → grid", walls, "objects_to_occupancy", DRAWN),
+        Case("objects → grid, inflated", walls, "objects_to_occupancy", {**DRAWN, "inflate": 0.3}),
         Case("network → grid", aisles, "topology_to_occupancy", FINE),
         Case("rooms → skeleton", rooms, "occupancy_to_topology"),
         Case("rooms → roadmap", rooms, "occupancy_to_topology", {"method": "roadmap", "samples": 50_000}),

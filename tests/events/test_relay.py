@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import os
 import signal
 import socket
@@ -131,10 +130,9 @@ def test_a_taken_port_is_not_tried_all_the_time(monkeypatch: pytest.MonkeyPatch)
 
 def test_a_router_of_the_operators(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Mode client: the router is somebody else's, and comes later than the server."""
-    caplog.set_level(logging.INFO, "app.events.single")
     port = free_port()
     where = f"tcp/127.0.0.1:{port}"
-    with running(settings_for(tmp_path, zenoh_mode="client", zenoh_connect=where)) as api:
+    with running(settings_for(tmp_path, zenoh_mode="client", zenoh_connect=where, log_level="info")) as api:
         api.post("environments", {"name": "patient"})
         eventually(lambda: api.get("/readyz").json()["events"]["state"] == "down", 30)
         router = Router(router_configuration(BusOptions(listen=where)))

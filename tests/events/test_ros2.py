@@ -287,7 +287,7 @@ def test_a_map_its_changes_and_its_network(api: Api, session: zenoh.Session) -> 
 
     changes = Heard(session, f"5/map_updates/{UPDATE}", latched=False)
     bridged = Heard(session, "map_updates", latched=False)
-    time.sleep(0.5)  # a volatile subscription counts from when the publisher knows of it
+    Heard(session, f"5/map/{GRID}").wait()  # a volatile subscription counts from when the publisher knows of it
     api.upload("farm", picture((2, 3), (4, 1), (6, 4)))
     for heard in (changes, bridged):
         change = update_of(heard.wait())

@@ -39,7 +39,7 @@ class Rounds(Single):
 
 
 def test_what_a_killed_process_said_no_longer_holds(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
+    caplog.set_level(logging.INFO, "app.events.single")
     (tmp_path / "some.json").write_text('{"state": "connected"}')
     slow = threading.Event()
     one = Rounds(tmp_path, slow.wait)

@@ -303,7 +303,7 @@ def test_local_objects_of_an_upload_stay_local() -> None:
     foreign = collection({**feature(None, {}), "place": point(500_000, 5_000_000)}, coordRefSys="x/EPSG/0/32630")
     layers = read(foreign, context)
     assert part(layers, HOME).geometry[0].is_empty
-    assert "not known" in context.warnings[0].problem
+    assert "x/EPSG/0/32630 is unsupported" in context.warnings[0].problem
     assert orjson.loads(write(layers)) == foreign
 
 

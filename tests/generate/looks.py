@@ -145,6 +145,8 @@ def clear_of_obstacles(layers: Layers, known: formats.Format, files: dict[str, b
             for i, p in zip(part.ids, part.properties, strict=True):
                 if p["kind"] != "edge" or len(read.vector("topology")) < len(grids):  # levels are joined
                     continue
+                if not {p["source"], p["target"]} <= at.keys():  # from one level to another
+                    continue
                 line = at[i] if shaped else shapely.LineString([at[p["source"]], at[p["target"]]])
                 steps = np.arange(0.0, line.length, grid.resolution / 2)
                 xy = shapely.get_coordinates(shapely.line_interpolate_point(line, steps))

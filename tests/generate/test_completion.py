@@ -170,7 +170,7 @@ def test_more_confidence_fills_less() -> None:
     assert filled[0] > filled[1] >= filled[2] > 0
     alone = np.full((60, 60), UNKNOWN, np.uint8)
     alone[10:40, 10:40] = FREE
-    with pytest.raises(CannotGenerate, match="give a lower confidence"):
+    with pytest.raises(CannotGenerate, match="set a lower confidence"):
         complete(alone)
 
 

@@ -1,9 +1,13 @@
-"""Words that mean something to us, with values of any type: edits and GeoJSON can bring them, no writer may stumble."""
+"""Words that mean something to us, with values of any type: edits and GeoJSON can bring them, no writer may stumble.
+
+``FLEETMAP_WORDS=500 pytest tests/hostile/test_words.py`` looks longer than CI does.
+"""
 
 # ruff: noqa: E501 - lists of values
 
 from __future__ import annotations
 
+import os
 import random
 import traceback
 from collections.abc import Iterator, Mapping
@@ -50,7 +54,7 @@ WORDS = (
     "value", "expires", "pose", "size", "datum", "bounds", "attribution", "data", "style", "layer", "level", "part", "more",
     *formats.all_formats(),
 )  # fmt: skip
-ROUNDS = 60
+ROUNDS = int(os.environ.get("FLEETMAP_WORDS", "15"))
 FOR_EACH = 6
 
 
