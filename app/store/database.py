@@ -225,14 +225,27 @@ class Database:
             kind = NoRoom if error.errno in NO_ROOM else Unavailable
             raise kind(f"the folder of the database cannot be written: {error.strerror}") from error
 
-    def integrity(self, limit: int, *, quick: bool = True) -> str | None:
-        """What SQLite's own check of its pages finds wrong, up to ``limit`` lines; None for nothing, or PostgreSQL."""
+    def tables(self) -> tuple[list[str], int]:
+        """SQLite's tables by name, and the bytes of its pages; none on PostgreSQL."""
+        if not self.sqlite:
+            return [], 0
+        with self.connected() as connection:
+            names = connection.exec_driver_sql("SELECT name FROM sqlite_master WHERE type = 'table'").scalars()
+            sizes = [connection.exec_driver_sql(f"PRAGMA {name}").scalar_one() for name in ("page_count", "page_size")]
+            return sorted(["sqlite_master", *names]), sizes[0] * sizes[1]
+
+    def integrity(self, limit: int, *, quick: bool = True, table: str | None = None) -> str | None:
+        """What SQLite's own check of its pages finds wrong, up to ``limit`` lines; None for nothing, or PostgreSQL.
+
+        table: the only one to check, with its indexes.
+        """
         if not self.sqlite:
             return None
         try:
             with self.connected() as connection:
                 check = "quick_check" if quick else "integrity_check"
-                lines = list(connection.exec_driver_sql(f"PRAGMA {check}({limit})").scalars())
+                of = limit if table is None else f'"{table}"'
+                lines = list(connection.exec_driver_sql(f"PRAGMA {check}({of})").scalars())[:limit]
         except DatabaseDamaged as error:
             return error.detail
         return None if lines == ["ok"] else "; ".join(map(str, lines))
