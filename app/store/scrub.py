@@ -1,7 +1,7 @@
 """The background scrub: stored bytes are hashed again, slowly, over and over, by one process of several.
 
-A pass reads SQLite's tables one by one, chunks, versions' roots, files and a sample of the cache. How far it is stands in the blob
-folder, beside the lock that one process holds; a start goes on where the last one ended.
+A pass reads SQLite's tables one by one, chunks, versions' roots, files and a sample of the cache. How far it is stands
+in the blob folder, beside the lock that one process holds; a start goes on where the last one ended.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CheckCache = Callable[[], Iterator[tuple[str, int, bool]]]
 
 @dataclass(slots=True)
 class ScrubState:
-    """How far a pass is. Times: seconds since 1970, 0.0 for never. after: the last table or hash of the step that was checked.
+    """How far a pass is. Times: seconds since 1970, 0.0 for never. after: what the step checked last (table, hash).
 
     found: damaged things by kind, of the pass under way; findings: of the last complete pass, and at least ``found``.
     """
