@@ -311,8 +311,8 @@ class Database:
         full = code == sqlite3.SQLITE_FULL or state == _DISK_FULL_STATE
         if full or (code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and self._is_full()):
             return NoRoom(
-                f"the server has no room left for its database ({_short(error)}); nothing was stored. Try again once "
-                "its operator has made room"
+                f"the server has no room left for its database ({_short(error)}); nothing was stored. Try again after "
+                "its operator has freed space"
             )
         if code == sqlite3.SQLITE_READONLY:
             return Unavailable(

@@ -251,6 +251,7 @@ def test_tokens(fleetmap: Fleetmap, network: Path) -> None:
     listed = fleetmap("token", "list", "--json")
     assert made["id"] in {row["id"] for row in listed.json}
     assert made["token"] not in listed.out
+    assert "ended" in fleetmap("token", "list").out.splitlines()[0].split()
     assert fleetmap("token", "delete", made["id"]).status == 0
     gone = fleetmap("versions", "guarded", "--token", made["token"])
     assert gone.status == 1
