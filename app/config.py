@@ -93,7 +93,7 @@ class Settings(BaseSettings):
         "requests that take over a second; `debug`: all requests except those answered from memory.",
     )
     log_format: LogFormat = Field(
-        default="text", description="`text`: lines for people; `json`: one JSON object per line."
+        default="text", description="Form of the log: `text`, lines for people, or `json`, one JSON object per line."
     )
 
     conversion_workers: int = Field(

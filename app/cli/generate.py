@@ -64,8 +64,8 @@ def generate(
 ) -> None:
     """Generate a synthetic site with all its maps: rows of trees, rooms, streets, caves, … Without a name, list them.
 
-    The list, --parameters and `--to FORMAT -o FILE` need no server. With --to, -O also takes parameters of the format. An
-    environment that does not exist is created, and removed again if the generator fails.
+    The list, --parameters and `--to FORMAT -o FILE` need no server. With --to, -O also takes parameters of the format.
+    An environment that does not exist is created, and removed again if the generator fails.
 
     Example: `fleetmap generate orchard --seed 7 -O rows=6 -e orchard-7`
     """

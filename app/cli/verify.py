@@ -56,8 +56,9 @@ def verify(
 
     Exit status 0: nothing is damaged (any more), 1: something is. It may run beside the server. Damaged cached maps are
     removed, since they are made again anyway; nothing else is changed without --repair. Repair tries the places of
-    --from, then reads the uploads of damaged versions again:
-    `fleetmap verify --repair --from /backup/originals --from https://other-server`.
+    --from, then reads the uploads of damaged versions again.
+
+    Example: `fleetmap verify --repair --from /backup/originals --from https://other-server`
     """
     local.require_server_python("verify")
     from app.cli.serving import load_settings
