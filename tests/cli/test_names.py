@@ -79,6 +79,8 @@ def test_unknown_names_get_a_proposal(fleetmap: Fleetmap, network: Path) -> None
         (("--versoin",), "there is no option --versoin (did you mean --version?)"),
         (("formats", "-z"), "there is no option -z"),
         (("overlays", "list", "proposals", "--state", "pendng"), "did you mean pending?"),
+        (("jobs", "list", "--state", "rnning"), "did you mean running?"),
+        (("token", "create", "x", "--role", "edtor"), "did you mean editor?"),
     ):
         told = fleetmap(*arguments)
         assert told.status == 2, arguments
