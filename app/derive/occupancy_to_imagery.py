@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes, _raster, derives
-from app.derive._grids import called, chosen
+from app.derive._grids import called, chosen, seen
 from app.derive._raster import Frame
 from app.errors import CannotConvert, MissingDatum
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -62,6 +62,7 @@ class Parameters:
     also=frozenset({"objects", "topology"}),
     parameters=Parameters,
     cost=40.0,
+    version=2,
     last=True,
 )
 def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
@@ -72,7 +73,8 @@ def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -
     a grid raises, CannotConvert where the plan would have too many pixels.
     """
     parts: dict[PartKey, Part] = {}
-    for key, grid in chosen(layers, parameters.grid, "what is where").items():
+    for key, stored in chosen(layers, parameters.grid, "what is where").items():
+        grid = seen(stored, called(key), notes)
         step = _step(grid, parameters.pixel, called(key))
         cells = _coarser(grid.cells, step)
         size = grid.resolution * step
