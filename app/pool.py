@@ -103,6 +103,11 @@ class Pool:
         if warm:
             _processes.set_forkserver_preload(list(warm))
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether a further job would wait."""
+        return self._idle.empty()
+
     def start(self) -> None:
         """Start all workers now, so that the first job does not pay for their imports; blocks until they are there.
 
