@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import fcntl
-import importlib
 import logging
 import os
 import shutil
@@ -24,7 +23,8 @@ from sqlalchemy.engine import make_url
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from app import __version__, logs
+from app import __version__, derive, logs
+from app import formats as every_format
 from app.api import (
     alignments,
     audit,
@@ -82,7 +82,7 @@ from app.fleet import Intake as FleetIntake
 from app.fleet import decide
 from app.ingest import Ingest, Provider
 from app.links import LinkSecrets
-from app.pool import Pool
+from app.pool import WARM, Pool
 from app.sandbox import Allowed
 from app.signing import Keys
 from app.store.scrub import Scrub
@@ -102,9 +102,6 @@ COLLECT_GRACE = timedelta(hours=6)
 
 CACHE_SHARE = 0.1
 """Of the cached maps a scrub hashes so many: each is hashed anyway when a process first meets it."""
-
-WARM = ("app.ingest.prepare", "app.convert.warm")
-"""What worker processes need, and the server for its first coverage table."""
 
 
 def create_app(settings: Settings) -> Server:
@@ -472,9 +469,9 @@ def close_services(here: Services) -> None:
 def _prepare(here: Services) -> None:
     """Do beside the start what the first request would wait for."""
     try:
+        every_format.all_formats()  # before the workers, which import theirs meanwhile
+        derive.all_derivations()
         here.pool.start()
-        for name in WARM:
-            importlib.import_module(name)
     finally:
         here.prepared.set()
 
