@@ -101,7 +101,7 @@ class Settings(BaseSettings):
         ge=1,
         le=256,
         description="Processes that read uploads and make maps, for each of the workers. Default: the number of "
-        "processors, at most 8.",
+        "processors, at most 8. While they are busy, one more computes coverage tables.",
     )
     conversion_queue: int = Field(
         default=64,

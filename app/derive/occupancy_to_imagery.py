@@ -22,6 +22,7 @@ from app.parameters import parameter
 
 NAME = "plan"
 MOST_PIXELS = 2**26
+WANTED = "what is where"
 
 PAPER, INK, NOTHING = (246, 246, 242), (44, 46, 52), (205, 205, 205)
 """Red, green, blue of free, occupied and unknown cells; costs between lie between paper and ink."""
@@ -56,6 +57,11 @@ class Parameters:
     draw_network: bool = parameter(False, "whether the network's edges are drawn")
 
 
+def _try(layers: Layers, parameters: Parameters) -> None:
+    for key, grid in chosen(layers, parameters.grid, WANTED).items():
+        _step(grid, parameters.pixel, called(key))
+
+
 @derives(
     gives="imagery",
     needs={"occupancy"},
@@ -64,6 +70,7 @@ class Parameters:
     cost=40.0,
     version=2,
     last=True,
+    trial=_try,
 )
 def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """A plan in plain colours, drawn from the grid with objects and, if asked for, the network over it.
@@ -73,7 +80,7 @@ def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -
     a grid raises, CannotConvert where the plan would have too many pixels.
     """
     parts: dict[PartKey, Part] = {}
-    for key, stored in chosen(layers, parameters.grid, "what is where").items():
+    for key, stored in chosen(layers, parameters.grid, WANTED).items():
         grid = seen(stored, called(key), notes)
         step = _step(grid, parameters.pixel, called(key))
         cells = _coarser(grid.cells, step)
