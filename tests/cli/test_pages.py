@@ -27,7 +27,7 @@ TUTORIALS = ("tutorials/first-environment.md", "tutorials/first-robot.md")
 
 ADDRESS = "http://127.0.0.1:8000"
 TOOLS = ("bash", "curl")
-SECONDS = 300
+SECONDS = 280
 
 
 def blocks(text: str) -> list[str]:
