@@ -1,6 +1,6 @@
 """The pages of ``docs/reference`` that the code declares: an MkDocs hook.
 
-``<!-- reference: NAME -->`` in a page is replaced by what ``BLOCKS[NAME]`` makes; each format gets a page of its own. So
+``<!-- reference: NAME -->`` in a page is replaced by what ``BLOCKS[NAME]`` makes, and each format gets its own page. So
 a page holds only what the code cannot say, and what the code says stands nowhere else.
 """
 
@@ -567,12 +567,13 @@ def cli() -> str:
 
 
 def _command(name: str, command: Any) -> list[str]:
-    if name == "fleetmap serve":
+    is_serve = name == "fleetmap serve"
+    if is_serve:
         command = get_command(commands.build("serve")).commands["serve"]  # type: ignore[attr-defined]
     out = [f"### {name}\n", f"{plain(inspect.cleandoc(command.help or ''))}\n"]
     rows = []
     for p in command.params:
-        if getattr(p, "hidden", False) or p.name in Settings.model_fields:
+        if getattr(p, "hidden", False) or (is_serve and p.name in Settings.model_fields):
             continue
         if p.param_type_name == "argument":
             label = code(p.metavar or p.human_readable_name.upper())
@@ -590,7 +591,7 @@ def _command(name: str, command: Any) -> list[str]:
             )
         )
     out.append(table(("argument or option", "default", "variable", "meaning"), rows))
-    if name == "fleetmap serve":
+    if is_serve:
         out.append("Each [setting](settings.md) is an option as well: `FLEETMAP_LOG_LEVEL` is `--log-level`.\n")
     for child in sorted(getattr(command, "commands", {})):
         out += _command(f"{name} {child}", command.commands[child])
