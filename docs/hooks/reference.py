@@ -21,6 +21,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import architecture
 import declared
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
@@ -62,9 +63,10 @@ def on_config(config: MkDocsConfig) -> None:
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> None:
-    """Add the formats' pages, and the picture of the generators' sites."""
+    """Add the formats' pages, and pictures."""
     for known in all_formats().values():
         files.append(File.generated(config, f"{FORMATS}/{known.name}.md", content=format_page(known)))
+    files.append(File.generated(config, "images/architecture.svg", content=architecture.svg()))
     picture = Path(inspect.getfile(generate)).with_name("sites.png")
     files.append(File.generated(config, "images/sites.png", abs_src_path=str(picture)))
 
