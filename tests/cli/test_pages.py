@@ -1,0 +1,146 @@
+"""The shell blocks of README and docs work as they are pasted.
+
+In docs, each block fenced with ``sh`` is run, page by page. ``console`` fences commands that need more than tests have
+(a robot, ROS 2, Docker, certificates). In the README, the blocks of the sections in ``README_SECTIONS`` are run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.cli.conftest import ServerProcess
+from tests.events.conftest import free_port
+
+ROOT = Path(__file__).resolve().parents[2]
+README_SECTIONS = ("A tour of 60 seconds", "The command line")
+TUTORIALS = ("tutorials/first-environment.md", "tutorials/first-robot.md")
+"""In the order in which a reader does them: each goes on where the one before it ended."""
+
+ADDRESS = "http://127.0.0.1:8000"
+TOOLS = ("bash", "curl")
+SECONDS = 280
+
+
+def blocks(text: str) -> list[str]:
+    """The bodies of the ``sh`` blocks of a Markdown text, in order."""
+    return re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+
+
+def read(page: str) -> str:
+    """A page of docs."""
+    return (ROOT / "docs" / page).read_text()
+
+
+def pages_with_commands() -> list[str]:
+    """Pages of docs with ``sh`` blocks, apart from the tutorials."""
+    docs = ROOT / "docs"
+    found = (str(path.relative_to(docs)) for path in sorted(docs.rglob("*.md")) if blocks(path.read_text()))
+    return [page for page in found if page not in TUTORIALS]
+
+
+class Place:
+    """A folder in which a demo server runs, as after ``make run``, with ``fleetmap`` in its ``.venv``."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        binaries = folder / ".venv" / "bin"
+        binaries.mkdir(parents=True)
+        (binaries / "activate").write_text(f'PATH="{binaries}:$PATH"\n')
+        command = binaries / "fleetmap"
+        command.write_text(f'#!/bin/sh\nPYTHONPATH="{ROOT}" exec "{sys.executable}" -m app.cli "$@"\n')
+        command.chmod(0o755)
+        self.server = ServerProcess(
+            "--demo",
+            environment={
+                "FLEETMAP_ZENOH_MODE": "router",
+                "FLEETMAP_ZENOH_LISTEN": f"tcp/127.0.0.1:{free_port()}",
+            },
+            folder=folder,
+        )
+
+    def run(self, commands: str) -> str:
+        """Paste commands into a shell in the folder; what they printed. Fails where one of them fails."""
+        script = """
+            set -euo pipefail
+            trap 'kill $(jobs -p) 2>/dev/null || true' EXIT
+            curl() { command curl --no-progress-meter --fail-with-body "$@"; echo; }
+            . .venv/bin/activate
+            """
+        script += commands.replace(ADDRESS, self.server.address)
+        clean = {name: value for name, value in os.environ.items() if not name.startswith("FLEETMAP_")}
+        done = subprocess.run(
+            ["bash", "-c", script],
+            cwd=self.folder,
+            env={**clean, "COLUMNS": "200"},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=SECONDS,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+    for tool in TOOLS:
+        if shutil.which(tool) is None:
+            (pytest.fail if os.environ.get("CI") else pytest.skip)(f"{tool} is not installed")
+    place = Place(tmp_path_factory.mktemp("place"))
+    try:
+        place.server.ready()
+        place.server.wait_for("administrator's token")
+        yield place
+    finally:
+        place.server.stop()
+
+
+def test_tutorials_work_as_pasted(place: Place) -> None:
+    output = place.run("\n".join(block for page in TUTORIALS for block in blocks(read(page))))
+    assert "my-farm: version 2\n" in output
+    assert "versions 2 → 3: objects 1 changed; topology 6 changed" in output, "the tutorial shows these lines"
+    assert "my-farm: version 4 holds what version 2 holds" in output
+    assert re.search(r"^production +3 .*1 of 1", output, re.MULTILINE)
+    assert '"edge": "Lane/0_Lane/1"' in output
+    assert (place.folder / "maps" / "current").readlink().name.startswith("2-")
+
+
+@pytest.mark.parametrize("page", pages_with_commands())
+def test_commands_of_page_work_as_pasted(page: str, place: Place) -> None:
+    login = f"export FLEETMAP_SERVER={ADDRESS} FLEETMAP_TOKEN=$(cat data/demo-token)\n"
+    place.run(login + "\n".join(blocks(read(page))))
+
+
+def test_readme_works_as_pasted(place: Place) -> None:
+    readme = (ROOT / "README.md").read_text()
+    pasted = ""
+    for heading in README_SECTIONS:
+        _, found, after = readme.partition(f"\n## {heading}\n")
+        assert found, f"README.md has no section {heading!r}: name the sections to run in README_SECTIONS"
+        pasted += "\n".join(blocks(after.split("\n## ")[0]))
+    assert ADDRESS in pasted
+    if shutil.which("ogrinfo") is None:
+        pasted = re.sub(r"^.*ogrinfo.*\n", "", pasted, flags=re.MULTILINE)
+    output = place.run(pasted.replace("my-farm", "readme-farm"))
+    answers = [json.loads(line) for line in output.splitlines() if line.startswith(("{", "["))]
+    created, uploaded, maps, report, history, channel = answers
+    assert created["version"] == 1, "the tour says that the upload is version 2"
+    assert (uploaded["version"], uploaded["warnings"]) == (2, [])
+    assert {row["format"]: row["state"] for row in maps}["tmap2"] == "direct"
+    assert report["format"] == "tmap2"
+    assert [row["version"] for row in history] == [2, 1, 0]
+    assert (channel["channel"], channel["version"]) == ("production", 2)
+    assert "readme-farm: nothing changed, version 2 stays" in output
+    assert "readme-farm: version 3 holds what version 1 holds" in output
+    assert "edge_id" in (place.folder / "network.tmap2.yaml").read_text()
+    assert "<Placemark>" in (place.folder / "readme-farm.kml").read_text()
