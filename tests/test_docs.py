@@ -153,7 +153,9 @@ def test_every_command_is_documented(pages: Mapping[str, str]) -> None:
 
 
 def test_every_metric_is_documented(pages: Mapping[str, str]) -> None:
-    named = {n for p in (ROOT / "app").rglob("*.py") for n in re.findall(r"[\"'](fleetmap_[a-z_]+)[\"'],", p.read_text())}
+    named = {
+        n for p in (ROOT / "app").rglob("*.py") for n in re.findall(r"[\"'](fleetmap_[a-z_]+)[\"'],", p.read_text())
+    }
     named -= {"fleetmap_agent", "fleetmap_ros", "fleetmap_heads"}
     assert {"fleetmap_head", "fleetmap_requests"} <= named
     for name in named:

@@ -10,7 +10,11 @@ ROOT = Path(__file__).parents[2]
 WRITE = ("api", "ingest", "pool", "bundle", "formats", "store", "events", "agent")
 READ = ("api", "convert", "store", "derive", "formats")
 FLOWS = (
-    ("#1565c0", WRITE, "Write: a request is read in a worker process and becomes a version and its event, which robots receive."),
+    (
+        "#1565c0",
+        WRITE,
+        "Write: a request is read in a worker process and becomes a version and its event, which robots receive.",
+    ),
     ("#2e7d32", READ, "Read: a version is planned, derived and written in the worker processes; the answer is cached."),
 )
 WIDTH, ROW, GAP, TOP = 900, 44, 10, 16
