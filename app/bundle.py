@@ -188,7 +188,6 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
     variables = _read_variables(files, bundle)
     others = {n: d for n, d in files.items() if n not in variables}
     groups, rest = _group(others, hints) if any(others.values()) or not variables else ([], sorted(others))
-    bundle.notices = {name: text for name in rest if (text := _notice(name, files[name]))}
     taken = _set_aside(groups, bundle)
     _check_options(groups, hints)
     found: list[Read] = []
@@ -204,11 +203,7 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
             errors.append(type(error))
     if errors:
         raise errors[0](details[0] if len(details) == 1 else "; ".join(details), problems)
-    for name in rest:
-        if files[name] and not _QUIET.search(PurePosixPath(name).name):
-            lacking = _lacking(name, files[name])
-            reason = "no format reads this file: it is kept as a source" + (f" ({lacking})" if lacking else "")
-            bundle.warnings.append(Problem(reason, name))
+    _keep_unread({name: files[name] for name in rest}, bundle)
     _compete(found, bundle)
     if hints.format is None and not any(u.format for u in bundle.files.values()) and not variables:
         lacks = {name: text for name in sorted(files) if (text := _lacking(name, files[name]))}
@@ -223,6 +218,23 @@ def read(files: Files, hints: Hints, known: Known, limits: Limits, *, inner: boo
     return bundle
 
 
+def _keep_unread(files: Files, bundle: Bundle) -> None:
+    """Take the credits of files that no format reads, and warn of those that may have been meant as maps."""
+    bundle.notices = {name: text for name, data in files.items() if (text := _notice(name, data))}
+    for name, data in files.items():
+        if data and not _QUIET.search(PurePosixPath(name).name):
+            lacking = _lacking(name, data)
+            reason = "no format reads this file: it is kept as a source" + (f" ({lacking})" if lacking else "")
+            bundle.warnings.append(Problem(reason, name))
+
+
+def _unread(files: Files) -> set[str]:
+    """The names of files that are neither a map nor belong to one."""
+    others = {n: d for n, d in files.items() if d and PurePosixPath(n).name not in VARIABLES_FILES}
+    empty = {n for n, d in files.items() if not d}
+    return empty | set(formats.group(others)[1] if others else ())
+
+
 def _take_content(files: Files, main: str, hints: Hints, limits: Limits, bundle: Bundle) -> bool:
     """Take the layers that a package carries exactly; False where its maps count, with the reason as a warning."""
     if dataclasses.replace(hints, format=None) != Hints() or hints.format not in (None, "environment"):
@@ -230,7 +242,7 @@ def _take_content(files: Files, main: str, hints: Hints, limits: Limits, bundle:
     else:
         try:
             with _blamed_on(main):
-                found = _content.read(files, main, limits)
+                found = _content.read(files, main, limits, lambda: _unread(files))
         except BadUpload:
             raise
         except (*formats.BAD_INPUT, FleetMapError, shapely.errors.ShapelyError) as error:
@@ -241,7 +253,8 @@ def _take_content(files: Files, main: str, hints: Hints, limits: Limits, bundle:
             bundle.files[name] = Use("environment", used=False)
         bundle.warnings.append(Problem(f"not used, the maps of the package count: {found}", main))
         return False
-    bundle.files = {name: Use("environment", used=True) for name in files}
+    bundle.files |= {name: Use("environment", used=True) for name in files if name not in found.added}
+    _keep_unread({name: files[name] for name in sorted(found.added)}, bundle)
     bundle.parts, bundle.datum, bundle.levels = dict(found.layers.parts), found.layers.datum, found.layers.levels
     bundle.origin = dict.fromkeys(bundle.parts, ((main,), "environment"))
     bundle.credits = found.credits

@@ -101,7 +101,7 @@ class Settings(BaseSettings):
         ge=1,
         le=256,
         description="Processes that read uploads and make maps, for each of the workers. Default: the number of "
-        "processors, at most 8.",
+        "processors, at most 8. While they are busy, one more computes coverage tables.",
     )
     conversion_queue: int = Field(
         default=64,
@@ -150,13 +150,14 @@ class Settings(BaseSettings):
         default=30.0,
         gt=0,
         le=3600,
-        description="Longest pause while a client sends a body, or reads an answer.",
+        description="How long a client may pause while it sends a request body or reads a response. After that a body "
+        "gets 408, and a response is cut off.",
     )
     body_pace: int = Field(
         default=1024,
         ge=1,
-        description="Bytes per second that a client must send or read on average, after the first "
-        "`FLEETMAP_BODY_SECONDS`; a slower one gets 408, or its connection is closed.",
+        description="Bytes per second that a client must send or read on average after the first "
+        "`FLEETMAP_BODY_SECONDS`. A slower body gets 408, and a slower response is cut off.",
     )
     max_connections: int = Field(
         default=4096,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import fcntl
-import importlib
 import logging
 import os
 import shutil
@@ -24,7 +23,8 @@ from sqlalchemy.engine import make_url
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from app import __version__, logs
+from app import __version__, derive, logs
+from app import formats as every_format
 from app.api import (
     alignments,
     audit,
@@ -82,7 +82,7 @@ from app.fleet import Intake as FleetIntake
 from app.fleet import decide
 from app.ingest import Ingest, Provider
 from app.links import LinkSecrets
-from app.pool import Pool
+from app.pool import WARM, Pool
 from app.sandbox import Allowed
 from app.signing import Keys
 from app.store.scrub import Scrub
@@ -102,9 +102,6 @@ COLLECT_GRACE = timedelta(hours=6)
 
 CACHE_SHARE = 0.1
 """Of the cached maps a scrub hashes so many: each is hashed anyway when a process first meets it."""
-
-WARM = ("app.ingest.prepare", "app.convert.warm")
-"""What worker processes need, and the server for its first coverage table."""
 
 
 def create_app(settings: Settings) -> Server:
@@ -243,7 +240,7 @@ def open_services(settings: Settings) -> Services:
     settings.data_dir.mkdir(parents=True, exist_ok=True)
     settings.blob_dir.mkdir(parents=True, exist_ok=True)
     store = Store(settings.database, settings.blob_dir)
-    pool: Pool | None = None
+    pools: list[Pool] = []
     try:
         with alone(settings.data_dir):
             if settings.database.startswith("sqlite"):
@@ -266,20 +263,25 @@ def open_services(settings: Settings) -> Services:
         if settings.models_dir is not None:
             os.environ["FLEETMAP_MODELS_DIR"] = str(settings.models_dir.resolve())  # where derivations look for it
             os.environ["FLEETMAP_MODELS_MAX_BYTES"] = str(settings.models_max_bytes)
-        pool = Pool(
-            settings.conversion_workers,
-            memory_bytes=settings.max_memory_bytes,
-            seconds=settings.max_seconds,
-            waiting=settings.conversion_queue,
-            warm=WARM,
-            allowed=allowed(settings),
-        )
-        return _services(settings, store, pool, intake)
+        # One more worker, started when it is needed: coverage tables do not wait for maps in the making.
+        pool, spare = pools = [_pool_of(settings, workers) for workers in (settings.conversion_workers, 1)]
+        return _services(settings, store, pool, spare, intake)
     except BaseException:
-        if pool is not None:
-            pool.close()
+        for opened in pools:
+            opened.close()
         store.close()
         raise
+
+
+def _pool_of(settings: Settings, workers: int) -> Pool:
+    return Pool(
+        workers,
+        memory_bytes=settings.max_memory_bytes,
+        seconds=settings.max_seconds,
+        waiting=settings.conversion_queue,
+        warm=WARM,
+        allowed=allowed(settings),
+    )
 
 
 def allowed(settings: Settings) -> Allowed:
@@ -291,16 +293,21 @@ def allowed(settings: Settings) -> Allowed:
     return Allowed(ports=(make_url(settings.database).port or 5432,))
 
 
-def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> Services:
-    def run(function: Callable[..., Any], *args: Any, **more: Any) -> Any:
+def _services(settings: Settings, store: Store, pool: Pool, spare: Pool, intake: Intake) -> Services:
+    def run(function: Callable[..., Any], *args: Any, by: Pool = pool, **more: Any) -> Any:
         try:
-            return pool.run(function, *args, **more)
+            return by.run(function, *args, **more)
         except DatabaseDamaged as error:  # a worker met it
             store.note_damage(error)
             raise
 
+    def run_trial(function: Callable[..., Any], *args: Any) -> Any:
+        return run(function, *args, by=spare if pool.is_busy else pool)
+
     metrics = Metrics()
-    service = Maps(store, run, settings.cache_dir, settings.limits, cache_bytes=settings.cache_bytes)
+    service = Maps(
+        store, run, settings.cache_dir, settings.limits, cache_bytes=settings.cache_bytes, run_trial=run_trial
+    )
     service.cache.on_damage = metrics.cache_damaged.inc
     access = Access(store.find_token, failures=settings.token_failures, insecure=settings.insecure_no_auth)
 
@@ -330,6 +337,7 @@ def _services(settings: Settings, store: Store, pool: Pool, intake: Intake) -> S
         ),
         store=store,
         pool=pool,
+        spare=spare,
         ingest=Ingest(store, run, settings.limits, provider_of(settings)),
         maps=service,
         access=access,
@@ -452,6 +460,7 @@ def close_services(here: Services) -> None:
     """End workers, remove the spool, close the store. Blocks."""
     here.fleet.close()
     here.pool.close()
+    here.spare.close()
     here.work.close()
     here.intake.close()
     here.store.close()
@@ -460,9 +469,9 @@ def close_services(here: Services) -> None:
 def _prepare(here: Services) -> None:
     """Do beside the start what the first request would wait for."""
     try:
+        every_format.all_formats()  # before the workers, which import theirs meanwhile
+        derive.all_derivations()
         here.pool.start()
-        for name in WARM:
-            importlib.import_module(name)
     finally:
         here.prepared.set()
 

@@ -13,13 +13,16 @@ from __future__ import annotations
 import dataclasses
 import math
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from app.errors import Invalid, Problem
 from app.model.names import did_you_mean
 
 T = TypeVar("T")
+
+_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
 
 
 def parameter(
@@ -36,7 +39,7 @@ def parse(cls: type[T], values: Mapping[str, Any], what: str = "parameter") -> T
 
     Invalid names every parameter that is unknown, of the wrong type or out of bounds, and says what is accepted.
     """
-    hints = get_type_hints(cls)
+    hints = _hints(cls)
     known = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     problems, out = [], {}
     for name, value in values.items():
@@ -56,7 +59,7 @@ def parse(cls: type[T], values: Mapping[str, Any], what: str = "parameter") -> T
 
 def describe(cls: type[Any]) -> list[dict[str, Any]]:
     """Each parameter as ``{name, schema, default, description}`` with a JSON schema, in declared order."""
-    hints = get_type_hints(cls)
+    hints = _hints(cls)
     out = []
     for f in dataclasses.fields(cls):
         schema = _schema(hints[f.name])

@@ -18,6 +18,7 @@ import threading
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -29,8 +30,17 @@ log = logging.getLogger(__name__)
 
 _processes = multiprocessing.get_context("forkserver")
 
+WARM = ("app.ingest.prepare", "app.convert.warm")
+"""What the server's worker processes import before their first job."""
+
 LOOK_SECONDS = 0.2
 """How often a job in line looks whether it is still wanted."""
+
+
+def start_beside(warm: tuple[str, ...] = WARM) -> None:
+    """Start what workers are forked from; its imports run beside whatever the caller does meanwhile."""
+    _processes.set_forkserver_preload(list(warm))
+    forkserver.ensure_running()
 
 
 class WorkerDied(FleetMapError):
@@ -102,6 +112,11 @@ class Pool:
         self._count = workers
         if warm:
             _processes.set_forkserver_preload(list(warm))
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a further job would wait."""
+        return self._idle.empty()
 
     def start(self) -> None:
         """Start all workers now, so that the first job does not pay for their imports; blocks until they are there.

@@ -29,7 +29,7 @@ SKIPPED = frozenset({".git", ".venv", "build", "data", "dist", "node_modules"})
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The built pages. A warning of MkDocs (a broken link or anchor, a page that no menu lists) is a failure."""
     from mkdocs.commands.build import build as build_pages
     from mkdocs.config import load_config
@@ -47,7 +47,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         pytest.fail("\n".join(said))
     finally:
         log.removeHandler(handler)
-    yield folder
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -212,7 +212,7 @@ def test_no_text_names_a_document_that_is_not_in_the_project() -> None:
     own |= {f"{name}.md" for name in all_formats()}
     own |= {"grammar.md", "extensions.md", "LIF.md"}  # standards: RON, LIF
     for path, text in texts():
-        named = {name for name in re.findall(r"(?<![\w/*.-])(?:[\w.-]+/)*([\w-]+\.md)\b", text)}
+        named = set(re.findall(r"(?<![\w/*.-])(?:[\w.-]+/)*([\w-]+\.md)\b", text))
         assert named <= own, f"{path} names {', '.join(sorted(named - own))}"
         for phrase in ("the contract", "house rules", "design page"):
             assert path == Path("tests/test_docs.py") or phrase not in text.lower(), f"{path} speaks of {phrase!r}"

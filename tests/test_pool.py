@@ -270,3 +270,19 @@ def test_a_confined_worker_has_no_network_and_starts_no_program(confined: Pool) 
         free.close()
     with pytest.raises(RuntimeError, match="PermissionError"):
         confined.run(work_execute)
+
+
+def test_what_workers_are_forked_from_is_started_beside() -> None:
+    """It has imported what it was told to, whoever starts the first worker."""
+    script = (
+        "import sys\n"
+        "from app import pool\n"
+        "pool.start_beside(('app.sandbox', 'app.links'))\n"
+        "one = pool.Pool(1, warm=())\n"
+        "try:\n"
+        "    print(one.run(eval, \"'app.links' in __import__('sys').modules\"))\n"
+        "finally:\n"
+        "    one.close()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    assert done.stdout.strip() == "True", done.stderr

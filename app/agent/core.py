@@ -467,7 +467,7 @@ class Agent:
         stands = any(p.get("channel") == PRODUCTION and p.get("version") is not None for p in plans or ())
         if stands or PRODUCTION in self._state.marks:
             return PRODUCTION
-        self._tell_once("following", channel=LATEST, detail="no channel production stands on a version yet")
+        self._tell_once("following", channel=LATEST, detail="the channel production points to no version yet")
         return LATEST
 
     def _install_latest(self, channel: str, manifest: Manifest) -> Outcome:

@@ -183,7 +183,7 @@ def _problem(error: BaseException) -> dict[str, Any]:
     if isinstance(error, FleetMapError):
         return problems.as_document(error)
     log.error("internal error in a job: %s", problems.describe(error))
-    return problems.document(500, "the server made a mistake; its log says where", title="Internal error")
+    return problems.document(500, "internal error; the server's log has the details", title="Internal error")
 
 
 def as_dict(job: Job) -> dict[str, Any]:

@@ -100,7 +100,9 @@ class _Scrubs(Collector):
         age = "Seconds since the last complete check of all stored data; +Inf where there was none yet."
         yield GaugeMetricFamily("fleetmap_scrub_age_seconds", age, value=state["age"])
         yield GaugeMetricFamily("fleetmap_scrub_running", "Whether such a check is under way.", value=state["running"])
-        findings = GaugeMetricFamily("fleetmap_scrub_findings", "Damaged things it found, by kind.", labels=["kind"])
+        findings = GaugeMetricFamily(
+            "fleetmap_scrub_findings", "Damaged items found by the check, by kind.", labels=["kind"]
+        )
         for kind, count in state["findings"].items():
             findings.add_metric([kind], count)
         yield findings

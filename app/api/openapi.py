@@ -179,7 +179,9 @@ def _finish(path: str, method: str, operation: dict[str, Any]) -> None:
         common["422"] = "A parameter, the body or a file cannot be used; `errors` says where."
         common["503"] = "Too busy, or a part of the server does not answer: try again after `Retry-After` seconds."
         if method != "get":
-            common["507"] = "The server's disk is full, and nothing was stored: try again once its operator made room."
+            common["507"] = (
+                "The server's disk is full, and nothing was stored: try again after its operator has freed space."
+            )
     if "requestBody" in operation:
         common |= {
             "400": "The body is malformed.",

@@ -230,12 +230,12 @@ def of_validation(error: RequestValidationError) -> Response:
 def of_bug(error: BaseException) -> Response:
     """The answer for anything else. The log gets the class and our own lines, no data, paths or tokens."""
     if isinstance(error, OSError) and error.errno in errors.NO_ROOM:
-        detail = "the server has no room left; nothing was stored. Try again once its operator has made room"
+        detail = "the server has no room left; nothing was stored. Try again after its operator has freed space"
         return of_error(errors.NoRoom(detail))
     if isinstance(error, OSError) and error.errno == errno.EROFS:
         return of_error(errors.Unavailable("the server's disk is read-only; nothing was stored. Try again later"))
     log.error("internal error: %s", describe(error))
-    return problem(500, "the server made a mistake; its log says where. Nothing was stored", title="Internal error")
+    return problem(500, "internal error; the server's log has the details. Nothing was stored", title="Internal error")
 
 
 def describe(error: BaseException) -> str:

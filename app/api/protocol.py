@@ -72,6 +72,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._left = LINGER_BYTES
         self._keep_alive = True
         self._proven = False
+        self._broken = False
 
     @property
     def is_idle(self) -> bool:
@@ -82,6 +83,11 @@ class BoundedProtocol(HttpToolsProtocol):
     def lingers(self) -> bool:
         """Whether all has been said, and what still comes in is dropped."""
         return self._linger_timer is not None
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether something that is no request came after the last one, whose answer is still due."""
+        return self._broken
 
     def give_way(self) -> None:
         """Close at once."""
@@ -213,7 +219,7 @@ class BoundedProtocol(HttpToolsProtocol):
                 self.transport.pause_reading()
             self._held += data
             return
-        if self.lingers:
+        if self.lingers or self._broken:
             self._left -= len(data)
             if self._left < 0:
                 self.transport.abort()
@@ -225,8 +231,10 @@ class BoundedProtocol(HttpToolsProtocol):
         super().data_received(data)
 
     def send_400_response(self, msg: str) -> None:  # noqa: ARG002  uvicorn's text is plain
-        """Not HTTP: told in the shape of all other errors."""
-        if self._head_size > MAX_HEAD:
+        """Not HTTP: told in the shape of all other errors, unless another answer is due before."""
+        if self.pipeline or not (self.is_idle or (self.cycle.more_body and not self.cycle.response_started)):
+            self._end_after_answers()
+        elif self._head_size > MAX_HEAD:
             self._refuse(431, "the request's head is too large")
         else:
             self._refuse(400, "this is not a valid HTTP request")
@@ -238,6 +246,15 @@ class BoundedProtocol(HttpToolsProtocol):
         self.flow.resume_reading()
         if self.transport.can_write_eof():
             self.transport.write_eof()
+
+    def _end_after_answers(self) -> None:
+        """Close once the requests that came completely are answered; nothing after them can be understood."""
+        if self.cycle.more_body:  # half of a request, whose answer has begun or comes after others
+            self.transport.abort()
+            return
+        self._head_came()
+        self._broken = True
+        self.cycle.keep_alive = False
 
     def _refuse(self, status: int, detail: str) -> None:
         body = orjson.dumps(document(status, detail))
@@ -294,7 +311,7 @@ class _Closing(asyncio.Transport):
 
     def close(self) -> None:
         """The answer is complete."""
-        if self._connection.cycle.more_body:
+        if self._connection.cycle.more_body or self._connection.is_broken:
             self._connection.linger()
         else:
             self._connection.transport.close()

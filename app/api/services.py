@@ -92,11 +92,12 @@ class Writability:
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """The parts of the server that routes use."""
+    """The parts of the server that routes use. spare: a worker for what should not wait for ``pool``."""
 
     options: ApiOptions
     store: Store
     pool: Pool
+    spare: Pool
     ingest: Ingest
     maps: Maps
     access: Access

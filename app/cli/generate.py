@@ -13,7 +13,7 @@ from app.cli.client import Client, path_of
 from app.cli.created import ensured
 from app.cli.folder import check_name, environment_name
 from app.cli.history import show_made
-from app.cli.maps import show_report
+from app.cli.maps import show_parameters, show_report
 from app.errors import Invalid, Problem
 
 if TYPE_CHECKING:
@@ -42,6 +42,10 @@ def generate(
     ] = None,
     option: Annotated[list[str] | None, options.named_values("A parameter of the generator")] = None,
     datum: options.DatumText = None,
+    describe: Annotated[
+        bool,
+        typer.Option("--parameters", help="Only show what the generator makes, and its parameters: needs no server."),
+    ] = False,
     to: Annotated[
         str | None,
         typer.Option(
@@ -60,13 +64,16 @@ def generate(
 ) -> None:
     """Generate a synthetic site with all its maps: rows of trees, rooms, streets, caves, … Without a name, list them.
 
-    The list and `--to FORMAT -o FILE` need no server. With --to, -O also takes parameters of the format. An
-    environment that does not exist is created, and removed again if the generator fails.
+    The list, --parameters and `--to FORMAT -o FILE` need no server. With --to, -O also takes parameters of the format.
+    An environment that does not exist is created, and removed again if the generator fails.
 
     Example: `fleetmap generate orchard --seed 7 -O rows=6 -e orchard-7`
     """
     if site is None:
         _list(as_json=as_json)
+        return
+    if describe:
+        _describe(site, as_json=as_json)
         return
     values = options.pairs(option)
     place = options.datum(datum)
@@ -107,13 +114,35 @@ def _list(*, as_json: bool) -> None:
             (
                 one["id"],
                 one["title"],
-                ", ".join(one["needs"]) or " or ".join(one["changes"]) or "nothing",
+                _worked_on(one),
                 ", ".join(one["gives"]),
                 ", ".join(p["name"] for p in one["parameters"]),
             )
             for one in known
         ],
     )
+
+
+def _describe(site: str, *, as_json: bool) -> None:
+    local.require_server_python("generate")
+    from app.generate import get_generator
+
+    known = get_generator(site).as_dict()
+    if as_json:
+        output.show_json(known)
+        return
+    output.show_members(
+        {
+            "generator": f"{known['id']}: {known['title']}",
+            "works on": _worked_on(known),
+            "gives": ", ".join(known["gives"]),
+        }
+    )
+    show_parameters(known["parameters"], "Parameters")
+
+
+def _worked_on(known: Mapping[str, Any]) -> str:
+    return ", ".join(known["needs"]) or " or ".join(known["changes"]) or "nothing"
 
 
 def _check_names(site: str, ours: set[str], to: str, values: Mapping[str, str]) -> None:

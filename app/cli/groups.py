@@ -6,13 +6,14 @@ import inspect
 import os
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
-from app.model.names import nearest
+from app.model.names import did_you_mean, nearest
 
 if TYPE_CHECKING:
     from typer._click import Context, HelpFormatter
@@ -31,7 +32,13 @@ LIST = "list"
 
 
 class Command(TyperCommand):
-    """A command with help in panels."""
+    """A command with help in panels, which proposes the nearest name for an unknown option."""
+
+    def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
+        """Parse the arguments."""
+        with _naming_options(self, ctx):
+            return super().parse_args(ctx, args)
+        raise AssertionError("unreachable")
 
     def format_help(self, ctx: Context, formatter: HelpFormatter) -> None:  # noqa: ARG002  the base class's
         """Print the help, as wide as the terminal."""
@@ -43,6 +50,7 @@ class Group(TyperGroup):
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
+        self.suggest_commands = False  # in Typer's words
         self.params.append(
             TyperOption(
                 param_decls=["--json"],
@@ -57,8 +65,16 @@ class Group(TyperGroup):
 
     def resolve_command(self, ctx: Context, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Find the command of the first argument and hand ``--json`` on to it."""
+        if not ctx.resilient_parsing and not args[0].startswith("-") and args[0] not in self.commands:
+            ctx.fail(f"there is no command {args[0]}{did_you_mean(args[0], self.commands)}")
         name, command, rest = super().resolve_command(ctx, args)
         return name, command, ["--json", *rest] if ctx.meta.pop(JSON, False) else rest
+
+    def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
+        """Parse the arguments."""
+        with _naming_options(self, ctx):
+            return super().parse_args(ctx, args)
+        raise AssertionError("unreachable")
 
     def format_help(self, ctx: Context, formatter: HelpFormatter) -> None:  # noqa: ARG002  the base class's
         """Print the help, as wide as the terminal."""
@@ -86,6 +102,19 @@ class Commands(typer.Typer):
     def command(self, name: str | None = None, **attributes: Any) -> Callable[[Any], Any]:
         """Register a function as a command."""
         return super().command(name, **{"cls": Command, **attributes})
+
+
+@contextmanager
+def _naming_options(command: Command | Group, ctx: Context) -> Iterator[None]:
+    """Tell of an unknown option in the words of all other errors; Typer's say "possible options"."""
+    try:
+        yield
+    except Exception as error:  # Typer brings the class along in some releases, and takes it from click in others
+        if type(error).__name__ != "NoSuchOption":
+            raise
+        option = getattr(error, "option_name", "")
+        names = [name for parameter in command.get_params(ctx) for name in parameter.opts if name.startswith("--")]
+        ctx.fail(f"there is no option {option}{did_you_mean(option, names)}")
 
 
 def show_help(command: Command | Group, ctx: Context) -> None:

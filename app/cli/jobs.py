@@ -9,7 +9,6 @@ import typer
 from app.cli import options, output
 from app.cli.client import Client, path_of
 from app.cli.groups import Commands
-from app.model.names import did_you_mean
 
 commands = Commands("List, show and cancel the server's long-running work.")
 
@@ -37,8 +36,7 @@ def list_jobs(
 
     Example: `fleetmap jobs list`
     """
-    if state is not None and state not in STATES:
-        raise typer.BadParameter(f"--state is one of {', '.join(STATES)}{did_you_mean(state, STATES)}")
+    options.check_choice("--state", state, STATES)
     with Client(server, token) as client:
         rows = client.get("/jobs", {"state": state, "limit": limit})
     if as_json:

@@ -317,12 +317,7 @@ def _show_format(known: Format, described: Mapping[str, Any]) -> None:
         }
     )
     for use, title in (("write", "Parameters of a map"), ("read", "Parameters of an upload")):
-        rows = [_parameter_row(p) for p in described["options"] if p["for"] == use]
-        if rows:
-            output.show("")
-            output.show_table(
-                ("parameter", "value", "unit", "default", "meaning"), rows, title=f"{title} (-O NAME=VALUE)"
-            )
+        show_parameters([p for p in described["options"] if p["for"] == use], title)
 
 
 def _needed(needs: Needs) -> str:
@@ -330,6 +325,14 @@ def _needed(needs: Needs) -> str:
     layers = ", or ".join(" with ".join(sorted(layers)) for layers in needs.one_of)
     datum = "a datum" if needs.datum else "a datum, if any content is in metres" if needs.anchor == "wgs84" else ""
     return "; and ".join(filter(None, (layers, datum)))
+
+
+def show_parameters(described: Sequence[Mapping[str, Any]], title: str) -> None:
+    """Show described parameters as a table, if there are any."""
+    if described:
+        output.show("")
+        columns = ("parameter", "value", "unit", "default", "meaning")
+        output.show_table(columns, map(_parameter_row, described), title=f"{title} (-O NAME=VALUE)")
 
 
 def _parameter_row(parameter: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
@@ -342,6 +345,8 @@ def _parameter_row(parameter: Mapping[str, Any]) -> tuple[str, str, str, str, st
         value = ", ".join(schema["enum"])
     elif low is not None and high is not None:
         value = f"{kind}, {low:g} to {high:g}"
+    elif low is not None or high is not None:
+        value = f"{kind}, at least {low:g}" if low is not None else f"{kind}, at most {high:g}"
     else:
         value = kind
     text = ",".join(map(str, default)) if isinstance(default, tuple) else "" if default is None else str(default)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
@@ -9,6 +10,7 @@ import typer
 from app.cli import completion
 from app.errors import Invalid
 from app.model.frame import Datum
+from app.model.names import did_you_mean
 
 CONNECTION = "Server and output"
 """Panel of the help with the options that most commands share."""
@@ -112,6 +114,12 @@ Create = Annotated[
         show_default=False,
     ),
 ]
+
+
+def check_choice(option: str, value: str | None, choices: Sequence[str]) -> None:
+    """Refuse a value that is none of the choices, with the nearest of them; None is the default."""
+    if value is not None and value not in choices:
+        raise typer.BadParameter(f"{option} is one of {', '.join(choices)}{did_you_mean(value, choices)}")
 
 
 def pairs(texts: list[str] | None) -> dict[str, str]:

@@ -41,8 +41,7 @@ def list_overlays(
 
     Example: `fleetmap overlays list farm --state pending`
     """
-    if state is not None and state not in STATES:
-        raise typer.BadParameter(f"--state is one of {', '.join(STATES)}{did_you_mean(state, STATES)}")
+    options.check_choice("--state", state, STATES)
     with Client(server, token) as client:
         rows = client.get(path_of("environments", environment, "overlays"), {"state": state})
     if as_json:

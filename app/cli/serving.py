@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import inspect
 import multiprocessing
 import os
@@ -23,9 +24,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 import typer
 
 from app.cli import local, options, output, variables
-from app.cli.client import Client
 from app.cli.problems import Refused
 from app.errors import FleetMapError, NoRoom, Unavailable
+from app.pool import start_beside
 
 if TYPE_CHECKING:
     from app.config import Settings
@@ -73,6 +74,9 @@ def serve(*, demo: bool = False, **values: Any) -> None:
     if demo:
         settings = with_demo_token(settings)
     listener = listen(settings.host, settings.port)
+    if settings.workers == 1:
+        start_beside()
+    gc.disable()  # until the application is made: what is loaded by then stays
     try:
         address = address_of(listener, secure=settings.tls_certificate is not None)
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
@@ -87,6 +91,7 @@ def serve(*, demo: bool = False, **values: Any) -> None:
             threading.Thread(target=_bring_demo, args=(address, token), daemon=True).start()
         _run(settings, listener)
     finally:
+        gc.enable()
         listener.close()
 
 
@@ -138,6 +143,7 @@ def demo(server: options.Server = None, token: options.Token = None, as_json: op
     Example: `fleetmap demo`
     """
     from app.cli import demo as orchard
+    from app.cli.client import Client
 
     with Client(server, token) as client:
         made = orchard.install(client)
@@ -155,7 +161,11 @@ def application() -> Any:
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    return _main().create_app(load_settings({}, warn=False))  # the process that started it has warned
+    made = _main().create_app(load_settings({}, warn=False))  # the process that started it has warned
+    gc.freeze()
+    gc.unfreeze()  # all of it counts as old now, without a look at any of it
+    gc.enable()
+    return made
 
 
 def load_settings(values: Mapping[str, Any], *, warn: bool = True) -> Settings:
@@ -365,6 +375,7 @@ def _end_with(parent: Any) -> None:
 def _bring_demo(address: str, token: str | None) -> None:
     """Once the server answers: install the demo and print what to try."""
     from app.cli import demo as orchard
+    from app.cli.client import Client
 
     try:
         wait_ready(address)

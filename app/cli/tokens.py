@@ -9,7 +9,6 @@ import typer
 from app.cli import options, output
 from app.cli.client import Client, path_of
 from app.cli.groups import Commands
-from app.model.names import did_you_mean
 
 commands = Commands("Create, list and delete access tokens (as administrator).")
 
@@ -42,8 +41,7 @@ def create(
 
     Example: `fleetmap token create tractor-7 --role robot --environments 'farm-*'`
     """
-    if role not in ROLES:
-        raise typer.BadParameter(f"--role is one of {', '.join(ROLES)}{did_you_mean(role, ROLES)}")
+    options.check_choice("--role", role, ROLES)
     body = {"name": name, "role": role, "environments": environments, "robot": robot, "expires": expires}
     with Client(server, token) as client:
         made = client.post("/tokens", body)
@@ -66,7 +64,7 @@ def show(server: options.Server = None, token: options.Token = None, as_json: op
     if as_json:
         output.show_json(rows)
         return
-    members = ("id", "name", "role", "environments", "robot", "expires")
+    members = ("id", "name", "role", "environments", "robot", "expires", "ended")
     output.show_table(members, ([row.get(member) or "" for member in members] for row in rows))
 
 

@@ -58,7 +58,7 @@ def verify(
     removed, since they are made again anyway; nothing else is changed without --repair. Repair tries the places of
     --from, then reads the uploads of damaged versions again.
 
-    Example: `fleetmap verify --repair --from /backup/originals --from https://other-server`.
+    Example: `fleetmap verify --repair --from /backup/originals --from https://other-server`
     """
     local.require_server_python("verify")
     from app.cli.serving import load_settings

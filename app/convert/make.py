@@ -74,7 +74,7 @@ def hindrance(database_url: str, blob_dir: str, version: Version, way: Chain) ->
     """In a worker: the step of a chain that fails on a version's content and why, or None where all work."""
     layers = applied_closures.load(open_store(database_url, blob_dir), version, way.keys)
     try:
-        derive.run(way.steps, layers)
+        derive.attempt(way.steps, layers)
     except CannotDerive as error:
         return Hindrance(error.step, error.detail, error.choose)
     except FleetMapError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import threading
 import time
 from collections import OrderedDict
@@ -12,7 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from app import formats, parameters, templates
+import orjson
+
+from app import __version__, formats, parameters, templates
 from app.bundle import Hints
 from app.convert import closures as applied_closures
 from app.convert import files as direct
@@ -21,6 +24,7 @@ from app.convert import recipe as recipes
 from app.convert import site
 from app.convert.cache import Cache, LostMap, Made, MadeFile, Product
 from app.convert.recipe import Hindrance, Recipe
+from app.convert.trials import Trials
 from app.errors import (
     Ambiguous,
     CannotConvert,
@@ -51,19 +55,28 @@ HOLD_ATTEMPTS = 5
 FAILURE_SECONDS = 60.0
 """How long an optional map that could not be made is not tried again."""
 
-TRIED = 1000
-"""Of how many derivations it is remembered whether they work on some content."""
+REMEMBERED = 1000
+"""Of how many maps it is remembered why they could not be made, or which edges lead through obstacles."""
 
 
 class Maps:
     """Maps of stored versions, made on demand in worker processes and kept by content."""
 
     def __init__(
-        self, store: Store, run: Run, cache_dir: Path, limits: Limits, *, cache_bytes: int = 4 * 2**30
+        self,
+        store: Store,
+        run: Run,
+        cache_dir: Path,
+        limits: Limits,
+        *,
+        cache_bytes: int = 4 * 2**30,
+        run_trial: Run | None = None,
     ) -> None:
+        """run_trial: as ``run``, for jobs that should not wait for maps in the making; default: ``run``."""
         self._store, self._run, self._limits = store, run, limits
+        self._run_trial = run_trial or run
         self.cache = Cache(cache_dir, cache_bytes)
-        self._tried: dict[Any, Hindrance | None] = {}
+        self._trials = Trials(cache_dir / "trials")
         self._crossed: dict[Any, list[Problem]] = {}
         self._failures: OrderedDict[str, tuple[float, FleetMapError]] = OrderedDict()
         self._guard = threading.Lock()
@@ -127,9 +140,10 @@ class Maps:
         for one in [recipe, *(member.recipe for member in recipe.members)]:
             if one.members or not one.steps or (one.spread is not None and one.spread.optional):
                 continue
-            tried = self._tried.get(_content(version, one.chain))
-            if tried is not None and tried.step:
-                return tried
+            with contextlib.suppress(KeyError):
+                tried = self._trials[_trial_key(version, one.chain)]
+                if tried is not None and tried.step:
+                    return tried
         return None
 
     def ready(self, recipe: Recipe) -> Made | None:
@@ -148,7 +162,8 @@ class Maps:
         except CannotDerive as error:
             if not recipe.members:  # else it is the member's
                 found = Hindrance(error.step, error.detail, error.choose)
-                self._remember(_content(recipe.version, recipe.chain), found)
+                key = _trial_key(recipe.version, recipe.chain)
+                self._trials.add(key, found, lasting=_is_lasting(recipe.chain))
             raise
         except (CannotConvert, NotFound, Invalid) as error:
             self._note_failure(recipe.key, error)
@@ -164,7 +179,7 @@ class Maps:
         with self._guard:
             self._failures[key] = (time.monotonic(), error)
             self._failures.move_to_end(key)
-            while len(self._failures) > TRIED:
+            while len(self._failures) > REMEMBERED:
                 self._failures.popitem(last=False)
 
     def _put_together(self, recipe: Recipe, stop: Stop | None) -> Made:
@@ -281,7 +296,7 @@ class Maps:
                 found = [Problem(f"edges were not checked against obstacles: {error.detail}")]
             with self._guard:
                 self._crossed[key] = found
-                while len(self._crossed) > TRIED:
+                while len(self._crossed) > REMEMBERED:
                     self._crossed.pop(next(iter(self._crossed)))
         return found
 
@@ -363,40 +378,27 @@ class Maps:
         """CannotConvert where the layers are there and hold too little for the format (a network without edges)."""
         if known.lacks is None:
             return
-        entries = {e.key: e.hash for e in version.parts}
-        key = (known.name, way.steps, version.datum, tuple((k, entries[k]) for k in way.keys))
-        with self._guard:
-            tried, found = key in self._tried, self._tried.get(key)
-        if not tried:
-            where = (self._store.database_url, str(self._store.blob_dir))
-            try:
-                found = self._run(making.lacking, *where, version, known.name, way)
-            except WorkerDied as error:
-                found = Hindrance("", error.detail)
-            self._remember(key, found)
+        found = self._try(_trial_key(version, way, known), way, making.lacking, version, known.name, way)
         if found is not None:
             raise CannotConvert(found.reason, [Problem(found.reason)])
 
     def _hindrance(self, version: Version, way: recipes.Chain) -> Hindrance | None:
         """The step of a chain that would not work on what is stored and why (no step: none is to blame)."""
         way = recipes.needed(way)
-        key = _content(version, way)
-        with self._guard:
-            if key in self._tried:
-                return self._tried[key]
+        return self._try(_trial_key(version, way), way, making.hindrance, version, way)
+
+    def _try(self, key: str, way: recipes.Chain, function: Callable[..., Any], *args: Any) -> Hindrance | None:
+        """What a worker finds in the way, if it was not found before."""
+        with contextlib.suppress(KeyError):
+            return self._trials[key]
         where = (self._store.database_url, str(self._store.blob_dir))
         try:
-            found: Hindrance | None = self._run(making.hindrance, *where, version, way)
+            found: Hindrance | None = self._run_trial(function, *where, *args)
+            lasting = _is_lasting(way)
         except WorkerDied as error:
-            found = Hindrance("", error.detail)
-        self._remember(key, found)
+            found, lasting = Hindrance("", error.detail), False
+        self._trials.add(key, found, lasting=lasting)
         return found
-
-    def _remember(self, key: Any, found: Hindrance | None) -> None:
-        with self._guard:
-            self._tried[key] = found
-            while len(self._tried) > TRIED:
-                self._tried.pop(next(iter(self._tried)))
 
     def convert(
         self,
@@ -498,7 +500,21 @@ def _with_origin(recipe: Recipe, origin: Mapping[str, str]) -> Recipe:
     return replace(recipe, origin=origin, members=members)
 
 
-def _content(version: Version, way: recipes.Chain) -> Any:
-    """What the outcome of a chain's derivations depends on."""
+def _trial_key(version: Version, way: recipes.Chain, known: formats.Format | None = None) -> str:
+    """The hash of what the outcome of a trial depends on: a chain's steps and, with ``known``, what a format lacks."""
+    keys = recipes.needed(way).keys if known is None else way.keys
     entries = {e.key: e.hash for e in version.parts}
-    return way.steps, version.datum, tuple((k, entries[k]) for k in recipes.needed(way).keys)
+    ingredients = {
+        "server": __version__,
+        "format": None if known is None else [known.name, known.version],
+        "steps": [[s.name, s.version, s.given] for s in way.steps],
+        "parts": [[k.layer, k.level, k.name, entries[k]] for k in keys],
+        "datum": version.datum.as_dict() if version.datum else None,
+        "levels": [[level.name, level.elevation] for level in version.levels],
+    }
+    return hashlib.sha256(orjson.dumps(ingredients)).hexdigest()
+
+
+def _is_lasting(way: recipes.Chain) -> bool:
+    """Whether a trial of these steps comes out the same at any time: a model may be supplied or removed."""
+    return not any(dict(step.given).get("model") for step in way.steps)

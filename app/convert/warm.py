@@ -1,7 +1,7 @@
 """Imported for its effect: what every first conversion would pay for is loaded.
 
-Worker processes are forked from one that has imported this, and the server is ready once it has. Native code of
-derivations (numba) is left out: most servers never need it.
+Worker processes are forked from one that has imported this. Native code of derivations (numba) is left out: most
+servers never need it.
 """
 
 import numpy as np

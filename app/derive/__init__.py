@@ -7,11 +7,12 @@ and when stuck says what to supply.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import heapq
 import importlib
 import pkgutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
@@ -50,6 +51,9 @@ class Notes:
 Function = Callable[[Layers, Any, Notes], Layers]
 """(stored and derived layers, parameters, notes) -> the new parts. Pure but for the notes."""
 
+Trial = Callable[[Layers, Any], None]
+"""(layers, parameters): raises what the function would raise on them, in a fraction of its time."""
+
 
 @dataclass(frozen=True, slots=True)
 class Derivation:
@@ -59,7 +63,7 @@ class Derivation:
     makes: names of the parts that it makes, where these are others than the usual one. Such a step is no way to the
     layer; it is taken where a part of such a name is asked for and not stored, and is given the layer's usual part,
     whose frame it may take. last: what it makes is good for a map and not for deriving more (a grid that knows of no
-    obstacle).
+    obstacle). trial: says whether it works, where that is cheaper to tell than to do.
     """
 
     name: str
@@ -73,6 +77,7 @@ class Derivation:
     also: frozenset[Layer] = frozenset()
     makes: frozenset[str] = frozenset()
     last: bool = False
+    trial: Trial | None = None
 
     def step(self) -> Step:
         """The derivation as it stands in a plan, with its default parameters."""
@@ -124,6 +129,7 @@ def derives(
     also: frozenset[Layer] = frozenset(),
     makes: frozenset[str] = frozenset(),
     last: bool = False,
+    trial: Trial | None = None,
 ) -> Callable[[Function], Function]:
     """Declare a function as a derivation; its name is its id, its docstring's first line its title."""
 
@@ -132,7 +138,7 @@ def derives(
         if name in _registry:
             raise ValueError(f"derivation {name} is declared twice")
         title = (function.__doc__ or name).strip().splitlines()[0]
-        known = (title, gives, frozenset(needs), cost, version, parameters, function, also, makes, last)
+        known = (title, gives, frozenset(needs), cost, version, parameters, function, also, makes, last, trial)
         _registry[name] = Derivation(name, *known)
         return function
 
@@ -216,14 +222,32 @@ def run(steps: Iterable[Step], layers: Layers, notes: Notes | None = None) -> La
     notes = notes or Notes()
     for step in steps:
         known = all_derivations()[step.name]
-        try:
+        with _blaming(step):
             made = known.function(layers, known.parameters(**dict(step.given)), notes)
-        except CannotConvert as error:
-            choose = isinstance(error, Ambiguous)
-            raise CannotDerive(error.detail, error.problems, step=step.name, choose=choose) from error
         if not known.makes and not known.last and all(map(_says_nothing, made.of(step.gives).values())):
             needs = " and ".join(step.needs)
             reason = f"{step.name} finds nothing in the stored {needs} to make {step.gives} of: supply {step.gives}"
             raise CannotDerive(f"{reason}, or {needs} with more in it", [Problem(reason)], step=step.name)
         layers = Layers({**layers.parts, **made.parts}, layers.datum or made.datum, layers.levels)
     return layers
+
+
+def attempt(steps: Sequence[Step], layers: Layers) -> None:
+    """Raise what ``run`` would raise; cheaper where the last step has a trial."""
+    last = all_derivations()[steps[-1].name]
+    if last.trial is None:
+        run(steps, layers)
+        return
+    layers = run(steps[:-1], layers)
+    with _blaming(steps[-1]):
+        last.trial(layers, last.parameters(**dict(steps[-1].given)))
+
+
+@contextlib.contextmanager
+def _blaming(step: Step) -> Iterator[None]:
+    """CannotDerive instead of CannotConvert: the step is to blame."""
+    try:
+        yield
+    except CannotConvert as error:
+        choose = isinstance(error, Ambiguous)
+        raise CannotDerive(error.detail, error.problems, step=step.name, choose=choose) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,15 +14,21 @@ from numpy.typing import NDArray
 from app.derive import Notes, _raster
 from app.errors import CannotConvert, Invalid, MissingDatum, MissingLayer, NotFound, Problem, TooLarge
 from app.model import obstacles, solids, worlds
-from app.model.features import Features, Properties
+from app.model.features import NO_GEOMETRY, Features, Properties
 from app.model.grid import OCCUPIED, UNKNOWN
 from app.model.layers import Layers
-from app.model.osm_areas import areas_of
+from app.model.obstacles import UNKNOWN_RADIUS_METRES
+from app.model.osm_areas import areas_of, ground_around, incomplete_areas
 
 Array = NDArray[np.float64]
 
 SURROUNDINGS = 5.0
 """Metres around the origin of a solid that cannot be read: ground of which nothing is known."""
+
+NO_AREA = "they have neither an area nor a size"
+WITHOUT_FILES = "they say neither shapes nor a size: upload the files of their models with them"
+POINTS = "they are points: say their size, or draw their outlines"
+INCOMPLETE = "their ways or nodes are missing, or their rings do not close: upload the whole area"
 
 MOST_TRIANGLES = 10_000_000
 """Of all solids of a site together: a mesh of some megabytes can stand in a world many thousand times."""
@@ -37,8 +42,8 @@ class Site:
 
     footprints: areas, lines or points (shapely); base and top: of each, metres above the level's floor (infinite where
     nothing says). triangles: float64 [n, 3, 3] of all solids, their heights above the level's floor too; owner: whose
-    they are. free: ground that is known to be free. unknown: ground around solids that cannot be read, which is never
-    free. unreadable: why they cannot, each reason once.
+    they are. free: ground that is known to be free. unknown: ground around solids that cannot be read and objects of
+    unknown extent, which is never free. unreadable: why they cannot, each reason once.
     """
 
     footprints: list[Any] = field(default_factory=list)
@@ -90,7 +95,7 @@ class Site:
         _raster.paint(cells, _raster.areas(self.footprints, frame, touched=True), OCCUPIED)
 
     def draw_unknown(self, cells: NDArray[np.uint8], frame: _raster.Frame) -> None:
-        """Make the ground around solids that cannot be read unknown where it is not occupied."""
+        """Make the ground of ``unknown`` unknown where it is not occupied."""
         if self.unknown:
             solid = cells == OCCUPIED
             _raster.paint(cells, _raster.areas(self.unknown, frame, touched=True), UNKNOWN)
@@ -117,15 +122,16 @@ def sites(
     visuals: bool = False,
     world: str | None = None,
     surroundings: float = SURROUNDINGS,
+    unknown_radius: float = UNKNOWN_RADIUS_METRES,
 ) -> dict[str, Site]:
     """The sites of all levels that have objects; of several worlds one (``app.model.worlds``).
 
-    surroundings: metres around a solid that cannot be read.
+    surroundings: metres around a solid that cannot be read. unknown_radius: metres around an object of unknown extent.
     Raises MissingDatum where objects are places on earth without one, Invalid where there is no such world.
     """
     known = solids.Solids(layers.resources(), visuals=visuals)
     out: dict[str, Site] = {}
-    reader = _Reader(layers, notes, known, doors_closed, surroundings)
+    reader = _Reader(layers, notes, known, doors_closed, surroundings, unknown_radius)
     parts = {key: part for key, part in layers.vector("objects").items() if len(part)}
     if world is not None and not any(worlds.names(part) for part in parts.values()):
         raise Invalid("no world is stored", [Problem("no world is stored", where="world")])
@@ -178,15 +184,23 @@ class _Reader:
     """Objects on their way to obstacles: what all parts share."""
 
     def __init__(
-        self, layers: Layers, notes: Notes, known: solids.Solids, doors_closed: bool, surroundings: float
+        self,
+        layers: Layers,
+        notes: Notes,
+        known: solids.Solids,
+        doors_closed: bool,
+        surroundings: float,
+        unknown_radius: float,
     ) -> None:
         self.layers, self.notes, self.known, self.doors_closed = layers, notes, known, doors_closed
-        self.surroundings = surroundings
+        self.surroundings, self.unknown_radius = surroundings, unknown_radius
         self.seen = replace(known, planes=True, visuals=True)
         self.found: dict[int, list[Array]] = {}
         self.left: Counter[str] = Counter()
         self.shapeless: Counter[str] = Counter()
-        self.broken: list[tuple[str, str]] = []
+        self.broken = 0
+        self.unsized: dict[str, list[str]] = {}
+        self.nowhere: list[str] = []
         self.unreadable: dict[str, list[str]] = {}
         self.bodiless = 0
         self.triangles = 0
@@ -199,11 +213,10 @@ class _Reader:
             role = obstacles.role_of(p, doors_closed=self.doors_closed)
             if role == "mark":
                 self.left[kind] += 1
-            elif role == "bodiless":
-                self.shapeless[kind] += 1
             elif role == "solids":
                 self._solids(part, k, site, level)
             else:
+                self.shapeless[kind] += role == "bodiless"
                 rows.append(k)
         if not rows:
             return
@@ -212,16 +225,29 @@ class _Reader:
         except Invalid as error:  # too far from the datum
             raise CannotConvert(error.detail, error.problems) from error
         old = areas_of(part, [k for k, geometry in zip(rows, metres, strict=True) if geometry.is_empty])
-        for k, geometry in zip(rows, metres, strict=True):
+        incomplete = incomplete_areas(part, rows)
+        for k, stored in zip(rows, metres, strict=True):
+            geometry = self._local(part, old[k]) if old.get(k) is not None else stored
+            if k in incomplete:
+                ground = ground_around(self._local(part, incomplete[k]), self.unknown_radius)
+                self._unknown(part, k, ground, INCOMPLETE, site)
+                if geometry.is_empty:
+                    self.bodiless += 1
+                    continue
             try:
-                self._outline(part, k, self._local(part, old[k]) if old.get(k) is not None else geometry, site, level)
+                self._outline(part, k, geometry, site, level)
             except Invalid as error:
-                self.broken.append((part.ids[k], error.detail))
+                self.broken += 1
+                self._around(part, k, geometry, error.detail, site)
 
     def _outline(self, part: Features, k: int, geometry: Any, site: Site, level: str) -> None:
         """An object by its geometry in metres: a body, or ground that is free."""
         p = part.properties[k]
-        is_ground = obstacles.role_of(p, doors_closed=self.doors_closed) == "ground"
+        role = obstacles.role_of(p, doors_closed=self.doors_closed)
+        if role == "bodiless":
+            self._around(part, k, geometry, WITHOUT_FILES, site)
+            return
+        is_ground = role == "ground"
         if is_ground:
             ground = obstacles.ground_of(p, geometry)
             if ground is not None:
@@ -236,8 +262,24 @@ class _Reader:
             site.footprints.append(body.area)
             site.base.append(body.base)
             site.top.append(body.top)
+            if obstacles.is_unsized(p, geometry):
+                self._around(part, k, geometry, POINTS, site)
         elif not is_ground:
             self.bodiless += 1
+            self._around(part, k, geometry, NO_AREA, site)
+
+    def _around(self, part: Features, k: int, geometry: Any, reason: str, site: Site) -> None:
+        """The ground of an object of unknown extent. geometry: what there is of it, in metres."""
+        p = part.properties[k]
+        if p.get("kind") != "floor":  # a floor is free only where it is known
+            self._unknown(part, k, obstacles.surroundings_of(p, geometry, self.unknown_radius), reason, site)
+
+    def _unknown(self, part: Features, k: int, ground: Any, reason: str, site: Site) -> None:
+        if ground is None or ground.is_empty:
+            self.nowhere.append(_name(part, k))
+            return
+        site.unknown.append(ground)
+        self.unsized.setdefault(reason, []).append(_name(part, k))
 
     def _local(self, part: Features, geometry: Any) -> Any:
         frame = self.layers.frame
@@ -250,11 +292,12 @@ class _Reader:
         try:
             made, unreadable = self.known.read(p)
         except (Invalid, TooLarge) as error:
-            middle = shapely.get_coordinates(shapely.centroid(part.geometry[k]))
-            at = (float(middle[0, 0]), float(middle[0, 1])) if len(middle) and part.local[k] else (0.0, 0.0)
-            made, unreadable = np.empty((0, 3, 3)), [solids.Unreadable(error, at)]
+            self._surround(_name(part, k), p, self._all_of(part, k), [error.detail], site)
+            return
         if unreadable:
-            self._surround(part.ids[k], p, unreadable, site)
+            origins = shapely.MultiPoint([one.at for one in unreadable])
+            ground = obstacles.surroundings_of({**p, "pose": None}, origins, self.surroundings)
+            self._surround(_name(part, k), p, ground, [one.error.detail for one in unreadable], site)
         self.triangles += len(made)
         if self.triangles > MOST_TRIANGLES:
             raise CannotConvert(f"the solids of the objects have more than {MOST_TRIANGLES} triangles")
@@ -265,11 +308,18 @@ class _Reader:
         else:
             self.left["with planes or pictures only"] += 1
 
-    def _surround(self, i: str, p: Properties, unreadable: Sequence[solids.Unreadable], site: Site) -> None:
-        """The ground around solids of unknown extent: a disc, and what of the object is seen or said to be there."""
-        size = obstacles.size_of(p)
-        reach = max(self.surroundings, math.hypot(*size[:2]) / 2 if size else 0.0)
-        around = [shapely.Point(one.at).buffer(reach) for one in unreadable]
+    def _all_of(self, part: Features, k: int) -> Any:
+        """The ground around an object whose solids cannot be placed."""
+        try:
+            geometry = part.take([k]).in_local(self.layers.frame)[0]
+        except (Invalid, MissingDatum):
+            geometry = NO_GEOMETRY
+        ground = obstacles.surroundings_of(part.properties[k], geometry, self.surroundings)
+        return shapely.Point(0, 0).buffer(self.surroundings) if ground is None else ground
+
+    def _surround(self, name: str, p: Properties, ground: Any, reasons: Iterable[str], site: Site) -> None:
+        """The ground around solids of unknown extent, and what of the object is seen or said to be there."""
+        around = [ground]
         shapes = p.get("shapes")
         for shape in shapes if isinstance(shapes, (list, tuple)) else ():
             try:
@@ -277,9 +327,8 @@ class _Reader:
             except (Invalid, TooLarge):
                 continue  # the disc stands for it
         site.unknown.append(shapely.union_all(around))
-        name = p.get("name")
-        for reason in dict.fromkeys(one.error.detail for one in unreadable):
-            self.unreadable.setdefault(reason, []).append(name if isinstance(name, str) and name else i)
+        for reason in dict.fromkeys(reasons):
+            self.unreadable.setdefault(reason, []).append(name)
             if reason not in site.unreadable:
                 site.unreadable.append(reason)
 
@@ -296,20 +345,29 @@ class _Reader:
         for kind, count in sorted(self.left.items()):
             self.notes.drop(f"objects {kind}", count, IN_NO_WAY)
         for kind, count in sorted(self.shapeless.items()):
-            self.notes.drop(
-                f"objects {kind}",
-                count,
-                "they say neither shapes nor a size: upload the files of their models with them",
-            )
-        self.notes.drop("objects", self.bodiless, "they have neither an area nor a size")
-        for i, why in self.broken[:100]:
-            self.notes.warn(f"left out: {why}", where=i)
-        self.notes.drop("objects", len(self.broken), "their ground cannot be read")
+            self.notes.drop(f"objects {kind}", count, WITHOUT_FILES)
+        self.notes.drop("objects", self.bodiless, NO_AREA)
+        self.notes.drop("objects", self.broken, "their ground cannot be read")
         for reason, names in list(self.unreadable.items())[:100]:
-            called = ", ".join(name[:80] for name in names[:5]) + (" …" if len(names) > 5 else "")
-            objects = f"{len(names)} objects have" if len(names) > 1 else "1 object has"
-            text = f"{objects} a solid that cannot be read ({called}): {reason}; the ground around it is unknown"
-            self.notes.warn(text, where=names[0][:80])
+            self._warn(names, "a solid that cannot be read", f"{reason}; the ground around it is unknown")
+        for reason, names in list(self.unsized.items())[:100]:
+            self._warn(names, "an unknown extent", f"{reason}; the ground around is unknown")
+        if self.nowhere:
+            self._warn(self.nowhere, "no known place", "a grid may show their ground as free; give them a geometry")
         if self.unreadable:
             why = "solids that cannot be read have an unknown extent"
             self.notes.fill("surroundings", self.surroundings, why, "surroundings")
+        if self.unsized:
+            why = "metres around objects of unknown extent"
+            self.notes.fill("unknown_radius", self.unknown_radius, why, "unknown_radius")
+
+    def _warn(self, names: Sequence[str], what: str, consequence: str) -> None:
+        known = list(dict.fromkeys(names))
+        called = ", ".join(name[:80] for name in known[:5]) + (" …" if len(known) > 5 else "")
+        objects = f"{len(names)} objects have" if len(names) > 1 else "1 object has"
+        self.notes.warn(f"{objects} {what} ({called}): {consequence}", where=names[0][:80])
+
+
+def _name(part: Features, k: int) -> str:
+    name = part.properties[k].get("name")
+    return name if isinstance(name, str) and name else part.ids[k]

@@ -27,17 +27,18 @@ class Parameters:
     also=frozenset({"objects", "resources"}),
     parameters=Parameters,
     cost=50.0,
-    version=2,
+    version=3,
     last=True,
 )
 def location_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """A blank occupancy grid: free inside the fence, unknown outside; it knows of no obstacle.
 
-    The origin is a whole multiple of the resolution, yaw 0. Raises MissingLayer where there is a datum but no fence, or
-    objects have solids that cannot be read;
-    CannotConvert where the grid would be too large.
+    The ground around objects of unknown extent is unknown. The origin is a whole multiple of the resolution, yaw 0.
+    Raises MissingLayer where there is a datum but no fence, or objects have solids that cannot be read; CannotConvert
+    where the grid would be too large.
     """
-    known = sites(layers, Notes())
+    told = Notes()
+    known = sites(layers, told)
     unreadable = [reason for site in known.values() for reason in site.unreadable]
     if unreadable:
         raise unreadable_error(unreadable, "a blank grid would call ground free that is not known")
@@ -45,8 +46,11 @@ def location_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) 
     for level, fence in fences(layers, notes).items():
         frame = framed(shapely.bounds(fence).tolist(), parameters.resolution, notes)
         cells = blank(frame, fence, [])
+        if level in known:
+            known[level].draw_unknown(cells, frame)
         parts[PartKey("occupancy", level, MAP)] = OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
     if not parts:
         raise MissingLayer("a blank grid needs a fence: upload a datum.yaml with gnss_fence, or a drawing as location")
+    notes.warnings += told.warnings
     notes.warn("the grid is blank: it is free wherever the fence allows, and knows of no obstacle")
     return Layers(parts, layers.datum, layers.levels)

@@ -16,6 +16,7 @@ from app.errors import Invalid, MissingLayer, Problem
 from app.model.frame import GROUND
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from app.model.layers import MAP, Layers, Part, PartKey
+from app.model.obstacles import UNKNOWN_RADIUS_METRES
 from app.parameters import parameter
 
 ENCLOSE = (
@@ -23,6 +24,12 @@ ENCLOSE = (
     "floors, or ask with outside_free=true where robots may drive all around"
 )
 """What to do where no ground is known to be free."""
+
+COVERED = (
+    "all of it is occupied or near objects of unknown extent; upload the files of their models, or ask with a smaller "
+    "unknown_radius"
+)
+"""What to do where no ground is left."""
 
 HEIGHT = 0.2
 """Metres above the floor at which a slice is taken unless asked otherwise: a usual height of a robot's laser."""
@@ -82,6 +89,14 @@ class Parameters:
         maximum=1000.0,
         unit="m",
     )
+    unknown_radius: float = parameter(
+        UNKNOWN_RADIUS_METRES,
+        "radius of unknown ground around an object of unknown extent (a model that says neither shapes nor a size, a "
+        "table or building that is a point, an invalid pose, an OpenStreetMap area whose rings do not close)",
+        minimum=0.0,
+        maximum=1000.0,
+        unit="m",
+    )
     doors: Literal["open", "closed"] = parameter("open", "whether doors let a robot through")
     visuals: bool = parameter(False, "whether shapes that are only seen and collide with nothing count")
     world: str | None = parameter(None, "which of several worlds; default: gazebo…, else the shortest name")
@@ -93,16 +108,16 @@ class Parameters:
     also=frozenset({"resources", "location"}),
     parameters=Parameters,
     cost=4.0,
-    version=2,
+    version=3,
 )
 def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """What stands on the ground at a height, as an occupancy grid for each level.
 
     Solids are cut, footprints rasterised; every cell that an obstacle touches is occupied. Free: the floors where there
     are any, else the fence, else what obstacles enclose; elsewhere unknown, as is the ground around solids that cannot
-    be read. The origin is a whole multiple of the resolution, yaw 0. Raises MissingLayer where nothing stands in a
-    robot's way, or solids that cannot be read leave nothing known; MissingDatum where the objects are places on earth
-    and there is none.
+    be read and objects of unknown extent. The origin is a whole multiple of the resolution, yaw 0. Raises MissingLayer
+    where nothing stands in a robot's way, or solids that cannot be read leave nothing known; MissingDatum where the
+    objects are places on earth and there is none.
     """
     if parameters.height is not None and parameters.band is not None:
         raise Invalid("height and band exclude each other", [Problem("give height or band", where="band")])
@@ -118,6 +133,7 @@ def objects_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -
         visuals=seen,
         world=parameters.world,
         surroundings=parameters.surroundings,
+        unknown_radius=parameters.unknown_radius,
     )
     around = fences(layers, notes)
     parts: dict[PartKey, Part] = {}
@@ -154,7 +170,8 @@ def _grid(
     if not here.count and (site.unreadable or not site.free):
         return None
     if not here.count:
-        notes.warn(f"nothing stands in a robot's way on the level {level}: all of its floor is free", where=level)
+        rest = " but the ground around objects of unknown extent" if here.unknown else ""
+        notes.warn(f"nothing stands in a robot's way on the level {level}: all of its floor is free{rest}", where=level)
     box = here.bounds() if fence is None else tuple(shapely.bounds(fence).tolist())
     if box is None:
         return None
@@ -170,12 +187,14 @@ def _grid(
         _raster.flooded(cells, FREE, UNKNOWN)
         why = "neither floors nor a fence say how far the site reaches"
         notes.fill("ground that no walls enclose", "unknown", why, "outside_free")
+    enclosed = bool((cells == FREE).any())
     here.draw_unknown(cells, frame)
     _raster.grown(cells, OCCUPIED, parameters.inflate / frame.resolution)
     if not (cells == FREE).any():
         if site.unreadable:
             raise unreadable_error(site.unreadable, f"no free ground of the level {level} is known")
-        notes.warn(f"no cell of the level {level} is free: {ENCLOSE}", where=level)
+        todo = COVERED if enclosed and here.unknown else ENCLOSE
+        notes.warn(f"no cell of the level {level} is free: {todo}", where=level)
     return OccupancyGrid(cells, frame.resolution, (*frame.origin, 0.0))
 
 

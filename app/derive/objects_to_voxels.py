@@ -64,7 +64,7 @@ class Parameters:
     also=frozenset({"resources"}),
     parameters=Parameters,
     cost=6.0,
-    version=2,
+    version=3,
     last=True,
 )
 def objects_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:

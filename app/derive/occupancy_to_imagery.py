@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from app.derive import Notes, _raster, derives
-from app.derive._grids import called, chosen
+from app.derive._grids import called, chosen, seen
 from app.derive._raster import Frame
 from app.errors import CannotConvert, MissingDatum
 from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -22,6 +22,7 @@ from app.parameters import parameter
 
 NAME = "plan"
 MOST_PIXELS = 2**26
+WANTED = "what is where"
 
 PAPER, INK, NOTHING = (246, 246, 242), (44, 46, 52), (205, 205, 205)
 """Red, green, blue of free, occupied and unknown cells; costs between lie between paper and ink."""
@@ -56,13 +57,20 @@ class Parameters:
     draw_network: bool = parameter(False, "whether the network's edges are drawn")
 
 
+def _try(layers: Layers, parameters: Parameters) -> None:
+    for key, grid in chosen(layers, parameters.grid, WANTED).items():
+        _step(grid, parameters.pixel, called(key))
+
+
 @derives(
     gives="imagery",
     needs={"occupancy"},
     also=frozenset({"objects", "topology"}),
     parameters=Parameters,
     cost=40.0,
+    version=2,
     last=True,
+    trial=_try,
 )
 def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """A plan in plain colours, drawn from the grid with objects and, if asked for, the network over it.
@@ -72,7 +80,8 @@ def occupancy_to_imagery(layers: Layers, parameters: Parameters, notes: Notes) -
     a grid raises, CannotConvert where the plan would have too many pixels.
     """
     parts: dict[PartKey, Part] = {}
-    for key, grid in chosen(layers, parameters.grid, "what is where").items():
+    for key, stored in chosen(layers, parameters.grid, WANTED).items():
+        grid = seen(stored, called(key), notes)
         step = _step(grid, parameters.pixel, called(key))
         cells = _coarser(grid.cells, step)
         size = grid.resolution * step

@@ -12,7 +12,7 @@ from app.derive import Notes, derives
 from app.derive._grids import called, seen
 from app.errors import CannotConvert, MissingLayer
 from app.model import masks
-from app.model.grid import UNKNOWN, OccupancyGrid
+from app.model.grid import UNKNOWN, OccupancyGrid, as_seen
 from app.model.layers import MAP, Layers, Part, PartKey
 from app.model.voxels import DEPTH, HALF, LOG_ODDS, VoxelMap, morton
 from app.parameters import parameter
@@ -25,6 +25,11 @@ COLUMNS = 2**28
 
 ROWS = 2**9
 """Rows that are sampled at once."""
+
+NOTHING_KNOWN = (
+    "voxels are made of a grid's occupied and free cells, and the stored grids have none: upload an occupancy grid, an "
+    "octree or a point cloud"
+)
 
 States = NDArray[np.uint8]
 """0 unknown, 1 free, 2 occupied."""
@@ -43,7 +48,20 @@ class Parameters:
     free: bool = parameter(True, "whether free cells become free voxels of the same height, or stay unknown")
 
 
-@derives(gives="voxels", needs={"occupancy"}, parameters=Parameters, cost=8.0, version=2)
+def _try(layers: Layers, parameters: Parameters) -> None:
+    found = [
+        _placed(as_seen(grid), parameters, layers.elevation(key.level), key.name)
+        for key, grid in _mains(layers).items()
+    ]
+    blocks = [block for block in found if block is not None]
+    if not blocks:
+        raise MissingLayer(NOTHING_KNOWN)
+    for block in blocks:
+        if np.count_nonzero(block.state) * (block.top - block.bottom) > MOST:  # so many, were all leaves the smallest
+            _cut(block)
+
+
+@derives(gives="voxels", needs={"occupancy"}, parameters=Parameters, cost=8.0, version=2, trial=_try)
 def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """The extrusion of a grid: each occupied cell as a column from the level's floor up, each free one as free space.
 
@@ -52,27 +70,45 @@ def occupancy_to_voxels(layers: Layers, parameters: Parameters, notes: Notes) ->
     MissingLayer where nothing is known, CannotConvert where the octree would be too large.
     """
     parts: dict[PartKey, Part] = {}
-    found = [k for k, grid in layers.grids().items() if k.name not in masks.MASKS and masks.NAME not in grid.properties]
-    mains = {key.level for key in found if key.name == MAP}
-    for key in found:
-        if key.level in mains and key.name != MAP:
-            continue
-        grid = seen(layers.grids()[key], called(key), notes)
-        made = _extruded(grid, parameters, layers.elevation(key.level), key.name)
-        if made is not None:
+    for key, grid in _mains(layers).items():
+        block = _placed(seen(grid, called(key), notes), parameters, layers.elevation(key.level), key.name)
+        if block is not None:
+            made = VoxelMap(block.edge, *_leaves(block))
             parts[PartKey("voxels", key.level, key.name)] = made
             if not made.leaf_counts()["occupied"]:
                 notes.warn(f"{key.name}: the grid has no occupied cell, so the voxels hold free space only")
     if not parts:
-        raise MissingLayer(
-            "voxels are made of a grid's occupied and free cells, and the stored grids have none: upload an occupancy "
-            "grid, an octree or a point cloud"
-        )
+        raise MissingLayer(NOTHING_KNOWN)
     notes.fill("height", parameters.height, "a grid does not say how high what it shows is", "height")
     return Layers(parts, layers.datum, layers.levels)
 
 
-def _extruded(grid: OccupancyGrid, parameters: Parameters, floor: float, name: str) -> VoxelMap | None:
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """The columns of one grid, all from one height to another.
+
+    edge: metres an edge of the smallest voxel. corner: x and y of the first column, bottom and top: heights, in voxels
+    from the origin.
+    """
+
+    name: str
+    edge: float
+    state: States
+    corner: tuple[int, int]
+    bottom: int
+    top: int
+
+
+def _mains(layers: Layers) -> dict[PartKey, OccupancyGrid]:
+    """The grids to extrude."""
+    grids = layers.grids()
+    found = {k: g for k, g in grids.items() if k.name not in masks.MASKS and masks.NAME not in g.properties}
+    mains = {key.level for key in found if key.name == MAP}
+    return {key: grid for key, grid in found.items() if key.name == MAP or key.level not in mains}
+
+
+def _placed(grid: OccupancyGrid, parameters: Parameters, floor: float, name: str) -> _Block | None:
+    """A grid's columns; None where nothing is known. CannotConvert where they reach beyond an octree."""
     edge = parameters.resolution or grid.resolution
     state, corner = _columns(grid, edge, parameters.free, name)
     if not state.any():
@@ -84,8 +120,7 @@ def _extruded(grid: OccupancyGrid, parameters: Parameters, floor: float, name: s
             f"an octree of {edge:g} m voxels reaches {HALF * edge:g} m from the origin, the grid {name} goes beyond: "
             "ask for a coarser resolution"
         )
-    depth, code, odds = _leaves(state, corner, bottom, top, name)
-    return VoxelMap(edge, depth, code, odds)
+    return _Block(name, edge, state, corner, bottom, top)
 
 
 def _states(grid: OccupancyGrid) -> States:
@@ -147,33 +182,41 @@ def _splat(out: States, state: States, grid: OccupancyGrid, edge: float, corner:
             out[np.clip(row, 0, out.shape[0] - 1), np.clip(column, 0, out.shape[1] - 1)] = 2
 
 
-def _leaves(
-    state: States, corner: tuple[int, int], bottom: int, top: int, name: str
-) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32]]:
-    """Depth, code and log-odds of the fewest leaves: squares of equal columns, cut into cubes between two heights."""
-    pieces = _pieces(bottom + HALF, top + HALF)
+def _cut(block: _Block) -> list[tuple[int, NDArray[np.int64], Square]]:
+    """The fewest leaves: squares of equal columns, cut into cubes between the two heights. CannotConvert if too many.
+
+    For each size 2^j of cubes: j, where they begin above each of the squares (in units of their size), the squares.
+    """
+    pieces = _pieces(block.bottom + HALF, block.top + HALF)
     tallest = max(k for _, k in pieces)
-    squares = _squares(state, (corner[0] + HALF, corner[1] + HALF), tallest)
-    depths, codes, odds = [], [], []
+    squares = _squares(block.state, (block.corner[0] + HALF, block.corner[1] + HALF), tallest)
+    out = []
     total = 0
     for start, k in pieces:
         for j in range(k + 1):
             every, largest = squares[j]
-            x, y, what = every if j == k else largest
+            square = every if j == k else largest
             stack = 1 << (k - j)
-            total += len(x) * stack
+            total += len(square[0]) * stack
             if total > MOST:
                 raise CannotConvert(
-                    f"the grid {name} would become more than {MOST} voxels: ask for a coarser resolution or a smaller "
-                    "height"
+                    f"the grid {block.name} would become more than {MOST} voxels: ask for a coarser resolution or a "
+                    "smaller height"
                 )
-            z = (start >> j) + np.arange(stack, dtype=np.int64)
-            n = len(x)
-            # Of the squares as smallest voxels from the middle, so that their codes can be cut to the depth.
-            whole = [np.repeat(x << j, stack) - HALF, np.repeat(y << j, stack) - HALF, np.tile(z << j, n) - HALF]
-            codes.append(morton(*whole) >> np.uint64(3 * j))
-            depths.append(np.full(n * stack, DEPTH - j, np.uint8))
-            odds.append(np.repeat(np.array(LOG_ODDS, np.float32)[what.astype(np.intp) - 1], stack))
+            out.append((j, (start >> j) + np.arange(stack, dtype=np.int64), square))
+    return out
+
+
+def _leaves(block: _Block) -> tuple[NDArray[np.uint8], NDArray[np.uint64], NDArray[np.float32]]:
+    """Depth, code and log-odds of a block's leaves, in order."""
+    depths, codes, odds = [], [], []
+    for j, z, (x, y, what) in _cut(block):
+        n, stack = len(x), len(z)
+        # Of the squares as smallest voxels from the middle, so that their codes can be cut to the depth.
+        whole = [np.repeat(x << j, stack) - HALF, np.repeat(y << j, stack) - HALF, np.tile(z << j, n) - HALF]
+        codes.append(morton(*whole) >> np.uint64(3 * j))
+        depths.append(np.full(n * stack, DEPTH - j, np.uint8))
+        odds.append(np.repeat(np.array(LOG_ODDS, np.float32)[what.astype(np.intp) - 1], stack))
     depth, code, odd = np.concatenate(depths), np.concatenate(codes), np.concatenate(odds)
     order = np.argsort(code << (np.uint64(3) * (np.uint64(DEPTH) - depth.astype(np.uint64))))
     return depth[order], code[order], odd[order]

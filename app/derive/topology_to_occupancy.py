@@ -63,7 +63,7 @@ class Parameters:
     also=frozenset({"objects", "resources", "location"}),
     parameters=Parameters,
     cost=40.0,
-    version=2,
+    version=3,
 )
 def topology_to_occupancy(layers: Layers, parameters: Parameters, notes: Notes) -> Layers:
     """Free along a network's edges, as wide as they are; occupied where objects stand; elsewhere unknown.

@@ -211,7 +211,7 @@ class Intake:
                 left += [said] if said.told is None else []
             except Exception:
                 log.exception("a report of %s was left out", said.heard.robot)
-                _tell(said, Unavailable("the server made a mistake; its log says where"))
+                _tell(said, Unavailable("internal error; the server's log has the details"))
         return left
 
     def _write_presence(self, *, everybody: bool) -> None:

@@ -319,6 +319,10 @@ def detect(name: str, data: bytes) -> Format | None:
     return next((f for f in readable if f.detect(name, data)), None)
 
 
+_APPLE_DOUBLE = b"\x00\x05\x16\x07"
+"""What macOS packs beside each file of an archive, under the file's name with ``._`` before it."""
+
+
 def group(files: Files, format_name: str | None = None) -> tuple[list[Group], list[str]]:
     """Sort an upload into maps: the groups, and the names that belong to none.
 
@@ -328,6 +332,8 @@ def group(files: Files, format_name: str | None = None) -> tuple[list[Group], li
     groups, used = [], set()
     asked = get_format(format_name) if format_name else None
     for name in sorted(files):
+        if files[name].startswith(_APPLE_DOUBLE):
+            continue
         known = asked if asked and asked.detect(name, files[name]) else None
         known = known or (None if asked else detect(name, files[name]))
         if known:

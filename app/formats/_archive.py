@@ -38,7 +38,10 @@ _ZIP64, _UNICODE_PATH = 0x0001, 0x7075
 
 _CHUNK = 2**20
 
-_TEXTS = (".kml", ".xml", ".osm", ".sdf", ".world", ".dae", ".yaml", ".yml", ".json", ".geojson", ".tmap2", ".tmap")
+_TEXTS = (
+    *(".kml", ".xml", ".osm", ".sdf", ".world", ".dae"),
+    *(".yaml", ".yml", ".json", ".geojson", ".ron", ".lif", ".tmap2", ".tmap"),
+)
 _TEXT_COST = 2
 """What parsing a text costs beside keeping other content: it must compress by this factor less. Real ones reach 40."""
 _IMAGES = (".pgm", ".ppm", ".pnm", ".pbm", ".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")

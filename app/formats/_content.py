@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -24,9 +24,10 @@ import shapely
 from numpy.typing import NDArray
 
 from app.errors import Problem, TooLarge, UnreadableFile
-from app.formats import Files, Limits, _json
+from app.formats import Files, Limits, _json, _raster
 from app.model.features import Features
 from app.model.frame import Datum, Level
+from app.model.imagery import LOCAL, Picture
 from app.model.layers import PART_TYPES, Layers, Part, PartKey, Resources
 
 FOLDER = "fleet_map/"
@@ -41,10 +42,11 @@ _KINDS: Mapping[str, type] = {"properties": dict, "crs": str, "binary": bool, "n
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """What a package says of its environment. credits: licences and credits by part."""
+    """What a package says of its environment. credits: licences and credits by part. added: files that are not its."""
 
     layers: Layers
     credits: Mapping[PartKey, tuple[str, ...]]
+    added: frozenset[str] = frozenset()
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -114,15 +116,21 @@ def owned(files: Files, main: str) -> set[str]:
     return {name for name in files if name.startswith(main.removesuffix(MAIN) + FOLDER)}
 
 
-def read(files: Files, main: str, limits: Limits) -> Content | str:
-    """The content, or why the maps count instead of it. Raises what is natural where it is damaged."""
+def read(files: Files, main: str, limits: Limits, unread: Callable[[], Collection[str]]) -> Content | str:
+    """The content, or why the maps count instead of it. Raises what is natural where it is damaged.
+
+    unread: the names of files that no format reads; it is called where files were added, since such a file changes no
+    map (a README, what a file manager leaves behind).
+    """
     top = _json.load(files[main], limits)
     if not isinstance(top, dict) or top.get("version") != VERSION:
         return f"its version is not {VERSION}"
     folder = main.removesuffix(MAIN)
     maps = {f"{folder}{path}": digest for path, digest in top["maps"].items()}
     others = files.keys() - owned(files, main)
-    for name in sorted(maps.keys() | others):
+    added = frozenset(others - maps.keys())
+    new_maps = added.difference(unread()) if added else added
+    for name in sorted(maps.keys() | new_maps):
         if name not in others:
             return f"{name} was removed"
         if name not in maps:
@@ -137,7 +145,7 @@ def read(files: Files, main: str, limits: Limits) -> Content | str:
         parts[key] = _decoded(key, row, {n.removeprefix(folder): data for n, data in files.items()}, limits)
     datum = None if top["datum"] is None else Datum(**top["datum"])
     levels = tuple(Level(str(name), float(elevation)) for name, elevation in top["levels"])
-    return Content(Layers(parts, datum, levels), stated)
+    return Content(Layers(parts, datum, levels), stated, added)
 
 
 def _decoded(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes], limits: Limits) -> Part:
@@ -160,7 +168,17 @@ def _decoded(key: PartKey, row: Mapping[str, Any], files: Mapping[str, bytes], l
         if not isinstance(values.get(name, wanted()), wanted):
             raise TypeError(f"{name} of the {key.layer} is no {wanted.__name__}")
     part: Part = kind(**values)
+    if isinstance(part, Picture):
+        _check_place(part)
     return part
+
+
+def _check_place(picture: Picture) -> None:
+    """Refuse a picture that lies nowhere, or whose CRS PROJ would look for in files."""
+    if picture.crs != LOCAL and not _raster.CRS_NAME.fullmatch(picture.crs):
+        _raster.crs_from_wkt(picture.crs)
+    if (reason := _raster.lies_nowhere(picture)) is not None:
+        raise UnreadableFile(f"a picture: {reason}", [Problem(reason)])
 
 
 def _value(value: Any, files: Mapping[str, bytes], most: int) -> Any:

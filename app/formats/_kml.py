@@ -456,11 +456,39 @@ def read_kml(
             [Problem(f"<{local_name(root)}> is not KML", line=root.sourceline)],
         )
     _xml.warn_of_active_content(data, context)
+    defined = {schema.get("name", "") for schema in root.iter("{*}Schema")}
+    _xml.warn_of_unknown(data, root, ELEMENTS | defined, context, free={*FREE, *defined}, namespace="kml")
     _check_values(root, context)
     reader = _Reader(context, pictures)
     reader.read(root, entry)
     return reader.layers(), reader.used
 
+
+FREE = frozenset({"ExtendedData", "Metadata"})
+"""Elements in which anything may stand."""
+
+_NAMES = """
+    address Alias altitude altitudeMode altitudeOffset angles AnimatedUpdate antialias BalloonStyle
+    balloonVisibility begin bgColor bottomFov Camera CascadingStyle
+    Change color colorMode cookie coord coordinates Create Data
+    delayedStart Delete description displayMode displayName Document drawOrder duration east end expires
+    ExtendedData extrude fill flyTo FlyTo flyToMode flyToView Folder fovy geomColor GeometryCollection geomScale
+    gridOrigin GroundOverlay h heading horizFov hotSpot href httpQuery Icon IconStyle ImagePyramid innerBoundaryIs
+    interpolate ItemIcon key kml LabelStyle labelVisibility latitude LatLonAltBox LatLonBox LatLonQuad leftFov
+    LinearRing LineString LineStyle Link linkDescription linkName linkSnippet listItemType ListStyle Location Lod
+    longitude LookAt maxAltitude maxFadeExtent maxHeight maxLodPixels maxSessionLength maxSnippetLines maxWidth
+    message Metadata minAltitude minFadeExtent minLodPixels minRefreshPeriod Model MultiGeometry MultiTrack name
+    near NetworkLink NetworkLinkControl north ObjArrayField ObjField open option Orientation outerBoundaryIs
+    outerColor outerWidth outline overlayXY Pair parent phoneNumber PhotoOverlay physicalWidth Placemark Playlist
+    playMode Point Polygon PolyStyle range refreshInterval refreshMode refreshVisibility Region Replace ResourceMap
+    rightFov roll rotation rotationXY scale Scale Schema SchemaData ScreenOverlay screenXY shape SimpleArrayData
+    SimpleArrayField SimpleData SimpleField size Snippet snippet SoundCue sourceHref south state Style StyleMap
+    styleUrl targetHref tessellate text textColor tileSize tilt TimeInstant timePosition TimeSpan TimeStamp topFov
+    Tour TourControl Track Update Url value viewBoundScale ViewerOptions viewFormat viewRefreshMode viewRefreshTime
+    ViewVolume visibility w Wait west when width x y z
+"""
+ELEMENTS = frozenset(_NAMES.split())
+"""Elements of KML 2.0 to 2.3 and of Google's gx extension, without their namespace."""
 
 _ANGLE = Number(-360.0, 360.0, unit="degrees")
 _TURN = replace(_ANGLE, doubtful=True)

@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from app.errors import BadUpload, Problem, TooLarge, UnreadableFile
 from app.formats import Limits
+from app.model.frame import MAX_METRES
 from app.model.gdal import CACHE, DATA_TYPES, gdal, native, opened, taken
+from app.model.geodesy import crs_bounds
 from app.model.imagery import LOCAL, Affine, Picture
 
 NO_TRANSFORM: Affine = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
@@ -42,6 +44,8 @@ GDAL_METADATA = 42112
 MAX_TAGS = 4096
 MAX_PAGES = 1000
 """Overviews and masks are pages too: real files have up to about thirty."""
+
+CRS_NAME = re.compile(r"(EPSG|ESRI|IAU_\d{4}):\d{1,7}|OGC:CRS84", re.IGNORECASE)
 
 _MEMORY_NAME = re.compile(r"/vsimem/[0-9a-f-]+/[0-9a-f-]+\.tif(?:, band \d+)?:?\s*")
 
@@ -160,6 +164,17 @@ def crs_from_wkt(text: str) -> str:
             return crs_name(rasterio.crs.CRS.from_wkt(text.strip()))
         except rasterio.errors.CRSError as error:
             raise UnreadableFile(f"its CRS cannot be read: {_reason(error)}") from error
+
+
+def lies_nowhere(picture: Picture) -> str | None:
+    """Why a picture has no place, beyond the local frame or where PROJ knows none on earth; None where it has one."""
+    ends = picture.outline()
+    if picture.crs == LOCAL:
+        beyond = not (np.abs(ends) <= MAX_METRES).all()
+        return f"it reaches beyond ±{MAX_METRES:g} m of the local frame" if beyond else None
+    if not np.isfinite(ends).all() or crs_bounds(picture.crs, ends) is None:
+        return f"{picture.crs if len(picture.crs) <= 40 else 'its CRS'} places it nowhere on earth"
+    return None
 
 
 def _reason(error: BaseException) -> str:

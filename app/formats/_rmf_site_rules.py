@@ -42,7 +42,7 @@ def check(files: Files) -> Iterator[Problem]:
     elif (offset := properties.get("geographic_offset")) is not None:
         if lost := missing(offset, ("anchor", "zoom", "visible")):
             yield refused(f"needs {', '.join(lost)}", main, where="properties.geographic_offset")
-        elif not numbers(offset["anchor"], 2, 2) or abs(offset["anchor"][0]) > 84:
+        elif not numbers(offset["anchor"], 2, 2) or not -80 <= offset["anchor"][0] <= 84:
             reason = "must be [latitude, longitude] within the zones of UTM (80° S to 84° N)"
             yield refused(reason, main, where="properties.geographic_offset.anchor")
     yield from _site(top, main)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Set
 
 from lxml import etree
 
 from app.errors import Problem, TooLarge, UnreadableFile
 from app.formats import Limits, ReadContext
+from app.model.names import did_you_mean
 from app.model.prolog import check_prolog
 
 __all__ = ["MAX_ATTRIBUTES", "attributes", "check_bounds", "check_prolog", "parse"]
@@ -72,6 +74,44 @@ def warn_of_active_content(data: bytes, context: ReadContext, *, has_scripts: bo
             often = f" ({len(found)} times)" if len(found) > 1 else ""
             line = low.count(b"\n", 0, found[0]) + 1
             context.warn(f"{what}{name}{often}: it is not run or followed here; a viewer may do so", line=line)
+
+
+def warn_of_unknown(
+    data: bytes, root: etree._Element, known: Set[str], context: ReadContext, *, free: Set[str], namespace: str = ""
+) -> None:
+    """Report elements that a format does not know by name, with how often, in one warning.
+
+    Args:
+        data: the text of ``root``.
+        known: names of the format's elements, without a namespace.
+        free: names of elements in which anything may stand.
+        namespace: what the format's own namespaces have in common; elements of others are extensions. Empty: the
+            format has none.
+    """
+    plain = data.replace(b"\0", b"") if b"\0" in data[:4] else data  # UTF-16 or UTF-32
+    names = {name.decode("utf-8", "replace").rpartition(":")[2] for name in set(_TAG.findall(plain))}
+    found: dict[str, list[etree._Element]] = {}
+    for name in sorted(names - known):
+        for element in root.iter("{*}" + name) if _NAME.fullmatch(name) else ():
+            space = etree.QName(element).namespace
+            ours = space is None or bool(namespace and namespace in space)
+            if ours and not any(etree.QName(above).localname in free for above in element.iterancestors()):
+                found.setdefault(name, []).append(element)
+    if not found:
+        return
+    first = min((elements[0] for elements in found.values()), key=lambda e: e.sourceline or 0)
+    told = [
+        f"<{name[:80]}>{did_you_mean(name, known)}{f' ({len(elements)} times)' if len(elements) > 1 else ''}"
+        for name, elements in list(found.items())[:_SHOWN]
+    ]
+    told += [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
+    context.warn(f"unknown elements, kept without effect: {', '.join(told)}", line=first.sourceline)
+
+
+_TAG = re.compile(rb"<([^\s<>/!?=\"']+)")
+_NAME = re.compile(r"[^\W\d][\w.-]*")
+_SHOWN = 10
+"""Unknown elements that a warning names."""
 
 
 def attributes(element: etree._Element) -> dict[str, str]:

@@ -46,6 +46,7 @@ from app.formats import (
     register,
 )
 from app.formats._choice import the_one
+from app.formats._sdf_elements import KNOWN
 from app.formats._text import DEGREES, number
 from app.model import masks, solids, worlds
 from app.model.features import Feature, Features, features, unique_ids
@@ -138,6 +139,7 @@ def read(files: Files, context: ReadContext) -> Layers:
         return _read_list(library, main, context)
     root = _sdf.parse(files[main], context.limits)
     _xml.warn_of_active_content(files[main], context, has_scripts=True)
+    _xml.warn_of_unknown(files[main], root, KNOWN, context, free={"plugin"})
     _sdf.warn_of_values(root, context)
     version = _sdf.version_of(root.get("version"))
     if version is None or not (1, 4) <= version <= _sdf.NEWEST:

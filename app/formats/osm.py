@@ -290,6 +290,7 @@ def read(files: Files, context: ReadContext) -> Layers:
     for problem, line, where in data.problems:
         context.warn(problem, line=line, where=where)
     _check_version(data, context)
+    _warn_of_values(data, context)
     document = _document(data)
     network = _Network(data, context)
     parts: dict[PartKey, Part] = {}
@@ -348,6 +349,26 @@ def _box(attributes: Mapping[str, str]) -> tuple[float, float, float, float] | N
         reason = f"the bounds {', '.join(texts)} are no box on earth"
         raise UnreadableFile(reason, [Problem(reason, where="<bounds>")])
     return west_, south_, east_, north_
+
+
+def _warn_of_values(data: Data, context: ReadContext) -> None:
+    """Report the values that would say a size or a speed and are none, each with how often; the tags are kept."""
+    found: dict[tuple[str, str], list[Any]] = {}
+    tagged = chain(((f"way {w.id}", w.tags) for w in data.ways), ((k, tags) for k, tags in data.tags.items()))
+    for place, tags in tagged:
+        for key in osm_tags.READ & tags.keys():
+            if key not in _OF_WAYS or "highway" in tags:
+                found.setdefault((key, tags[key]), [place, 0])[1] += 1
+    for (key, value), (place, count) in found.items():
+        if not osm_tags.is_understood(key, value):
+            where = place if isinstance(place, str) else f"node {data.ids[place]}"
+            often = f" ({count} times)" if count > 1 else ""
+            reason = f"the tag {key}={str(value)[:40]!r} is not understood: kept without effect{often}"
+            context.warn(reason, where=where)
+
+
+_OF_WAYS = frozenset({"lanes", "maxspeed", "maxspeed:forward", "maxspeed:backward"})
+"""Keys that are read for highways only."""
 
 
 class _Network:

@@ -28,7 +28,7 @@ from app.formats import Files, Format, Limits, Needs, Parts, ReadContext, WriteC
 from app.formats._choice import file_stem, the_one
 from app.formats._text import DEGREES, METRES
 from app.model.frame import MAX_METRES, is_writable
-from app.model.geodesy import WGS84, crs_bounds
+from app.model.geodesy import WGS84
 from app.model.imagery import LOCAL, USUAL_COLOURS, Affine, Picture, displayed, placed
 from app.model.layers import Layers, PartKey
 from app.model.resampling import resampled
@@ -61,7 +61,6 @@ SUPPLY = (
     "a picture does not say where it lies: add a world file (.pgw, .jgw, .tfw), or the option corners=lat,lon,… of two "
     "opposite or all four corners, or, for a floor plan, metres_per_pixel with origin and yaw"
 )
-_CRS = re.compile(r"(EPSG|ESRI|IAU_\d{4}):\d{1,7}|OGC:CRS84", re.IGNORECASE)
 _NUMBER = re.compile(rb"[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d+)?|[-+]?(nan|inf(inity)?)", re.IGNORECASE)
 
 
@@ -243,7 +242,11 @@ def _pixels(image: Image.Image, mode: str, kind: type[np.generic]) -> NDArray[An
 
 def _check_options(options: ReadOptions) -> None:
     problems = []
-    if options.crs is not None and options.crs.lower() not in (LOCAL, "wgs84") and not _CRS.fullmatch(options.crs):
+    if (
+        options.crs is not None
+        and options.crs.lower() not in (LOCAL, "wgs84")
+        and not _raster.CRS_NAME.fullmatch(options.crs)
+    ):
         problems.append(Problem(f"crs must be EPSG:<number>, wgs84 or local, got {options.crs[:80]!r}", where="crs"))
     corners = options.corners
     if corners is not None:
@@ -390,16 +393,12 @@ def _sidecar_crs(files: Files, context: ReadContext) -> str | None:
 
 def _check_place(picture: Picture, image: str) -> None:
     """Refuse what lies nowhere: beyond the local frame, or where PROJ knows no place on earth."""
-    ends = picture.outline()
-    if picture.crs == LOCAL:
-        if not (np.abs(ends) <= MAX_METRES).all():
-            reason = f"it reaches beyond ±{MAX_METRES:g} m of the local frame: say crs=EPSG:<number>"
-            raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image)])
-        return
-    if not np.isfinite(ends).all() or crs_bounds(picture.crs, ends) is None:
-        name = picture.crs if len(picture.crs) <= 40 else "its CRS"
-        reason = f"{name} places it nowhere on earth: say another with crs=EPSG:<number>, or crs=local"
-        raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image, where="crs")])
+    reason = _raster.lies_nowhere(picture)
+    if reason is not None:
+        local = picture.crs == LOCAL
+        advice = "say crs=EPSG:<number>" if local else "say another with crs=EPSG:<number>, or crs=local"
+        reason = f"{reason}: {advice}"
+        raise UnreadableFile(f"{image}: {reason}", [Problem(reason, image, where=None if local else "crs")])
 
 
 # --- writing ------------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from app.errors import BadUpload, CannotConvert, CannotGenerate, Invalid, Proble
 from app.generate import MAX_CELLS, MAX_OBJECTS, Source, generates
 from app.model import masks, solids
 from app.model.features import Features, features
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, as_seen, unknown_grey
 from app.model.layers import MAP, Layers, Part, PartKey
 from app.model.obstacles import footprint_of
 from app.parameters import parameter
@@ -195,7 +195,8 @@ class _Level:
     def __init__(self, given: Layers, options: Perturbation, source: Source, notes: Notes, level: str) -> None:
         self.given, self.options, self.source, self.notes, self.level = given, options, source, notes, level
         self.parts: dict[PartKey, Features] = {k: p for k, p in given.vector("objects", level).items() if len(p)}
-        grids = given.grids(level)
+        self.stored = given.grids(level)
+        grids = {k: as_seen(g) for k, g in self.stored.items()}
         masked = {k for k, g in grids.items() if k.name in masks.MASKS or masks.NAME in g.properties}
         self.maps = {k: g for k, g in grids.items() if k not in masked}
         noisy = self.maps if options.grid is None else {k: g for k, g in grids.items() if k.name == options.grid}
@@ -230,7 +231,7 @@ class _Level:
             if key in self.noisy:
                 cells = self._noise(key, grid, cells, kept)
             if not np.array_equal(cells, grid.cells):
-                out[key] = replace(grid, cells=cells)
+                out[key] = _with_grey(self.stored[key], cells)
         return out
 
     # --- objects -----------------------------------------------------------------------------------------------------
@@ -738,6 +739,13 @@ def _apart(things: Sequence[_Thing]) -> int:
             if moved[k]:
                 there[k].moved = (0.0, 0.0, 0.0)
                 put += 1
+
+
+def _with_grey(stored: OccupancyGrid, cells: NDArray[np.uint8]) -> OccupancyGrid:
+    """A stored grid with other cells; those of unknown's grey that stay unknown keep it."""
+    grey = unknown_grey(stored)
+    kept = cells if grey is None else np.where(grey & (cells == UNKNOWN), np.uint8(FREE), cells)
+    return replace(stored, cells=kept)
 
 
 # --- cells ------------------------------------------------------------------------------------------------------------

@@ -88,8 +88,8 @@ class Features:
             raise ValueError(
                 f"columns differ: {n} ids, {len(self.geometry)} geometries, {len(self.properties)} properties"
             )
-        if self.local.dtype != bool:
-            raise ValueError(f"local must be bool, got {self.local.dtype}")
+        if self.local.dtype != bool or self.local.ndim != 1:
+            raise ValueError(f"local must be bool [{n}], got {self.local.dtype} {self.local.shape}")
         if not bool(shapely.is_geometry(self.geometry).all()):
             raise ValueError("geometry must hold shapely geometries; NO_GEOMETRY stands for none")
         if len(set(self.ids)) != n:

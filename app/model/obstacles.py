@@ -12,6 +12,9 @@ of kind     in ``OBSTACLES``: by its geometry; an OpenStreetMap kind only where 
 with        ``shapes``: by its solids (``app.model.solids``), whatever its kind but those of ``IGNORED``
 with        ``height`` or ``size``: by its geometry, or a box of its size where it is a point, whatever its kind
 of kind     ``door``: as an obstacle only where doors are taken as closed, whatever its shapes
+of kind     in ``BROAD``: as a point without width and size also as ground of which nothing is known
+of kind     in ``SOLID``: without shapes and size as ground of which nothing is known (``surroundings_of``), but from a
+            world, which tells all solids of its models: there it has none
 else        not: regions, points of interest, paths, roads, lights, measurements …
 =========== ===========================================================================================================
 
@@ -54,6 +57,10 @@ CABIN_WALL = 0.05
 SOLID = frozenset({"model", "include"})
 """Kinds that have a body, which may be in files that nobody has supplied."""
 
+UNKNOWN_RADIUS_METRES = 0.7
+"""Unknown ground around an object of unknown extent, in metres: Open-RMF's chairs, desks and cabinets reach about as
+far from their origin, and its buildings have their lanes no nearer."""
+
 OBSTACLES: Mapping[str, float] = {
     **dict.fromkeys(("wall", "fence", "hedge", "barrier", "railing"), 0.1),
     **dict.fromkeys(("building", "obstacle", "furniture", "shelf", "rack", "table", "machine", "container"), 0.1),
@@ -63,6 +70,14 @@ OBSTACLES: Mapping[str, float] = {
 }
 """Kinds that stand in the way, and how wide a line of that kind, or a point's disc, is where nothing says: metres.
 The 0.1 m of a wall is what rmf_building_map_tools builds."""
+
+BROAD = frozenset(
+    {
+        *("building", "obstacle", "furniture", "shelf", "rack", "table", "machine", "container"),
+        *("water", "pond", "ditch", "stream"),
+    }
+)
+"""Kinds that cover more ground than the disc of a point of which nothing says how wide it is."""
 
 WIDEST = 1000.0
 """Metres of a line's or a point's width: beyond it is a mistake."""
@@ -135,7 +150,7 @@ def role_of(properties: Properties, *, doors_closed: bool = False) -> Role:
         return "solids"
     if width_of(properties) is not None:
         return "outline"
-    return "bodiless" if kind in SOLID and not _tags(properties) else "mark"
+    return "bodiless" if kind in SOLID and not _tags(properties) and "gazebo" not in properties else "mark"
 
 
 def body_of(properties: Properties, geometry: Any, width: float | None = None) -> Body | None:
@@ -154,6 +169,29 @@ def ground_of(properties: Properties, geometry: Any) -> Any | None:
     """The ground of a floor or a lift's cabin, on which robots stand: polygons; None where it has none."""
     area = _area(shapely.force_2d(geometry), properties, 0.0)
     return area if area is not None and area.area > 0 else None
+
+
+def is_unsized(properties: Properties, geometry: Any) -> bool:
+    """Whether an object is a mere point and covers more ground than its disc."""
+    is_point = shapely.get_type_id(geometry) in (0, 4)
+    is_broad = is_point and str(properties.get("kind")) in BROAD
+    return is_broad and size_of(properties) is None and not says_width(properties)
+
+
+def surroundings_of(properties: Properties, geometry: Any, radius: float) -> Any | None:
+    """The ground that an object of unknown extent may cover; None if it has neither a geometry nor a place.
+
+    Args:
+        geometry: in local metres.
+        radius: metres around its geometry and its pose; half the diagonal of its size if that is more.
+    """
+    pose, size = properties.get("pose"), size_of(properties)
+    xy = pose[:2] if isinstance(pose, (list, tuple)) else ()
+    is_place = len(xy) == 2 and all(isinstance(v, (int, float)) and abs(v) <= MAX_METRES for v in xy)
+    candidates = (shapely.force_2d(geometry), shapely.Point(xy) if is_place else shapely.Point())
+    places = [place for place in candidates if not place.is_empty]
+    reach = max(radius, math.hypot(*size[:2]) / 2 if size else 0.0)
+    return shapely.union_all(shapely.buffer(places, reach)) if places else None
 
 
 def footprint_of(properties: Properties, geometry: Any, known: solids.Solids) -> Any | None:
@@ -252,14 +290,14 @@ def width_of(properties: Properties) -> float | None:
 
 def _area(geometry: Any, p: Properties, width: float) -> Any:
     """The ground that an object covers: a polygon in metres; None where it has none."""
-    if geometry.is_empty:
-        return None
     kind = int(shapely.get_type_id(geometry))
     size = size_of(p)
-    if kind in (0, 4) and size is not None:
+    if size is not None and (kind in (0, 4) or geometry.is_empty):
         x, y = size[0] / 2, size[1] / 2
         pose = _pose(p, geometry)
         return None if pose is None else shapely.Polygon(solids.placed(_flat(shapely.box(-x, -y, x, y)), pose)[:, :2])
+    if geometry.is_empty:
+        return None
     if kind in (3, 6):
         return shapely.make_valid(geometry)
     if kind == 7:

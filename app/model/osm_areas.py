@@ -18,6 +18,9 @@ from app.model.features import Features, Properties
 
 Lines = Sequence[NDArray[np.float64]]
 
+LINES = frozenset({"barrier", "waterway", "highway"})
+"""Tags of closed ways that stand along their course and not on the ground inside."""
+
 
 def is_multipolygon(properties: Properties) -> bool:
     """Whether an object is a relation that says that it is an area."""
@@ -33,16 +36,72 @@ def areas_of(part: Features, rows: Iterable[int]) -> dict[int, Any | None]:
     index = part.index() if wanted else {}
     out: dict[int, Any | None] = {}
     for k in wanted:
-        members = part.properties[k]["osm"].get("members")
-        ways = [
-            index.get(f"w{member[1]}", -1)
-            for member in (members if isinstance(members, (list, tuple)) else ())
-            if isinstance(member, (list, tuple)) and len(member) == 3 and member[0] == "way"
-        ]
+        ways = [index.get(way, -1) for way, _ in _ways(part.properties[k])]
         lines = [shapely.get_coordinates(part.geometry[row]) for row in ways if row >= 0]
         complete = not any(part.properties[row]["osm"].get("missing") for row in ways if row >= 0)
         out[k] = assembled(lines) if complete else None
     return out
+
+
+def incomplete_areas(part: Features, rows: Iterable[int]) -> dict[int, Any]:
+    """The ways that are there of each incomplete area among these rows: a collection in their coordinates, maybe empty.
+
+    Incomplete: a multipolygon of which rings do not close or outer ways are absent, and a closed way of an area without
+    some of its nodes.
+    """
+    out: dict[int, Any] = {}
+    chosen = [k for k in rows if isinstance(part.properties[k].get("osm"), Mapping)]
+    index = part.index() if any(is_multipolygon(part.properties[k]) for k in chosen) else {}
+    areas = areas_of(part, [k for k in chosen if part.geometry[k].is_empty])
+    for k in chosen:
+        p = part.properties[k]
+        if is_multipolygon(p) and part.ids[k].startswith("r"):
+            ways = [(index.get(way, -1), role) for way, role in _ways(p)]
+            if (k in areas and areas[k] is None) or any(row < 0 and role != "inner" for row, role in ways):
+                out[k] = shapely.geometrycollections([part.geometry[row] for row, _ in ways if row >= 0])
+        elif _lacks_nodes(p["osm"]):
+            out[k] = shapely.geometrycollections([part.geometry[k]])
+    return out
+
+
+def ground_around(ways: Any, radius: float) -> Any:
+    """The ground that an area may cover of which only these ways are there: polygons; empty if there are none.
+
+    It is their convex hull and a disc over each gap from a loose end to the next one: a missing way with a right angle
+    runs along its rim.
+
+    Args:
+        ways: a collection in metres.
+        radius: metres around the hull.
+    """
+    lines = shapely.get_parts(ways)
+    lines = lines[(shapely.get_type_id(lines) == 1) & ~shapely.is_empty(lines)]
+    both = shapely.get_coordinates([shapely.get_point(lines, 0), shapely.get_point(lines, -1)])
+    at, count = np.unique(both, axis=0, return_counts=True)
+    loose = at[count % 2 == 1]
+    ground = [shapely.buffer(shapely.convex_hull(ways), radius)]
+    if len(loose) > 1:
+        ends = shapely.points(loose)
+        (one, other), gap = shapely.STRtree(ends).query_nearest(ends, exclusive=True, return_distance=True)
+        ground += list(shapely.buffer(shapely.points((loose[one] + loose[other]) / 2), gap / 2))
+    return shapely.union_all(ground)
+
+
+def _ways(p: Properties) -> list[tuple[str, Any]]:
+    """(id, role) of a relation's ways."""
+    members = p["osm"].get("members")
+    return [
+        (f"w{member[1]}", member[2])
+        for member in (members if isinstance(members, (list, tuple)) else ())
+        if isinstance(member, (list, tuple)) and len(member) == 3 and member[0] == "way"
+    ]
+
+
+def _lacks_nodes(own: Mapping[str, Any]) -> bool:
+    """Whether a way goes around an area and some of its nodes have no place."""
+    refs, tags = own.get("refs"), own.get("tags")
+    is_ring = isinstance(refs, (list, tuple)) and len(refs) > 3 and refs[0] == refs[-1]
+    return is_ring and bool(own.get("missing")) and isinstance(tags, Mapping) and not LINES & tags.keys()
 
 
 def assembled(lines: Lines) -> Any | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 LEVEL_HEIGHT = 3.0
@@ -71,6 +71,12 @@ def count(said: Any) -> float | None:
     return None if match is None else float(match[1])
 
 
+def is_understood(key: str, value: Any) -> bool:
+    """Whether a tag's value means something to the functions below; true of all tags that they do not look at."""
+    read = _READ.get(key)
+    return read is None or read(value) is not None or (read is speed and value in _NO_LIMIT)
+
+
 def width(tags: Mapping[str, Any]) -> float | None:
     """Metres across a line or a point: ``width``, ``est_width``, what its ``diameter`` or ``circumference`` says."""
     found = metres(tags.get("width")) or metres(tags.get("est_width"))
@@ -109,3 +115,15 @@ def base(tags: Mapping[str, Any]) -> float | None:
 def speed_limit(tags: Mapping[str, Any], way: Literal["forward", "backward"]) -> float | None:
     """Metres per second along a way's direction or against it; that of the direction wins."""
     return speed(tags.get(f"maxspeed:{way}")) or speed(tags.get("maxspeed"))
+
+
+_NO_LIMIT = frozenset({"none", "signals", "variable"})
+"""Values of ``maxspeed`` that mean no lasting limit (Key:maxspeed)."""
+
+_READ: Mapping[str, Callable[[Any], float | None]] = {
+    **dict.fromkeys(("width", "est_width", "height", "min_height"), metres),
+    **dict.fromkeys(("lanes", "building:levels", "building:min_level"), count),
+    **dict.fromkeys(("maxspeed", "maxspeed:forward", "maxspeed:backward"), speed),
+}
+READ = frozenset(_READ)
+"""Keys of the tags whose values are read as numbers."""

@@ -474,8 +474,8 @@ def _unreadable(error: OSError) -> _Unreadable:
 def _refusal(error: OSError) -> Unavailable:
     if error.errno in NO_ROOM:
         return NoRoom(
-            f"the server has no room left for files ({reason_of(error)}); nothing was stored. Try again once its "
-            "operator has made room"
+            f"the server has no room left for files ({reason_of(error)}); nothing was stored. Try again after its "
+            "operator has freed space"
         )
     return Unavailable(f"the blob folder cannot be written: {reason_of(error)}. Try again later")
 

@@ -89,7 +89,7 @@ class Channels(Base):
                 ).one_or_none()
                 if known is None or known.version is None:
                     near = nearest_channel(connection, row, ref)
-                    raise NotFound(f"{environment} has no channel {ref!r} that stands on a version{near}")
+                    raise NotFound(f"{environment} has no channel {ref!r} that points to a version{near}")
                 number, sequence = known.version, known.sequence
             found, sequence = read_version(connection, row, number), int(sequence or 0)
             if mode == "ignore":

@@ -225,14 +225,27 @@ class Database:
             kind = NoRoom if error.errno in NO_ROOM else Unavailable
             raise kind(f"the folder of the database cannot be written: {error.strerror}") from error
 
-    def integrity(self, limit: int, *, quick: bool = True) -> str | None:
-        """What SQLite's own check of its pages finds wrong, up to ``limit`` lines; None for nothing, or PostgreSQL."""
+    def tables(self) -> tuple[list[str], int]:
+        """SQLite's tables by name, and the bytes of its pages; none on PostgreSQL."""
+        if not self.sqlite:
+            return [], 0
+        with self.connected() as connection:
+            names = connection.exec_driver_sql("SELECT name FROM sqlite_master WHERE type = 'table'").scalars()
+            sizes = [connection.exec_driver_sql(f"PRAGMA {name}").scalar_one() for name in ("page_count", "page_size")]
+            return sorted(["sqlite_master", *names]), sizes[0] * sizes[1]
+
+    def integrity(self, limit: int, *, quick: bool = True, table: str | None = None) -> str | None:
+        """What SQLite's own check of its pages finds wrong, up to ``limit`` lines; None for nothing, or PostgreSQL.
+
+        table: the only one to check, with its indexes.
+        """
         if not self.sqlite:
             return None
         try:
             with self.connected() as connection:
                 check = "quick_check" if quick else "integrity_check"
-                lines = list(connection.exec_driver_sql(f"PRAGMA {check}({limit})").scalars())
+                of = limit if table is None else f'"{table}"'
+                lines = list(connection.exec_driver_sql(f"PRAGMA {check}({of})").scalars())[:limit]
         except DatabaseDamaged as error:
             return error.detail
         return None if lines == ["ok"] else "; ".join(map(str, lines))
@@ -298,8 +311,8 @@ class Database:
         full = code == sqlite3.SQLITE_FULL or state == _DISK_FULL_STATE
         if full or (code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and self._is_full()):
             return NoRoom(
-                f"the server has no room left for its database ({_short(error)}); nothing was stored. Try again once "
-                "its operator has made room"
+                f"the server has no room left for its database ({_short(error)}); nothing was stored. Try again after "
+                "its operator has freed space"
             )
         if code == sqlite3.SQLITE_READONLY:
             return Unavailable(

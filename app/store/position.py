@@ -9,8 +9,7 @@ from typing import Final
 
 import numpy as np
 import shapely
-from geoalchemy2 import functions as postgis
-from sqlalchemy import ColumnElement, Connection, LargeBinary, and_, literal, or_, select, update
+from sqlalchemy import Boolean, ColumnElement, Connection, LargeBinary, and_, func, literal, or_, select, update
 
 from app.errors import Damaged, Invalid, Problem
 from app.model.geodesy import distance
@@ -121,8 +120,7 @@ class Position(Base):
             x, y = place
             return and_(area.c.south <= y, area.c.north >= y, area.c.west <= x, area.c.east >= x)
         wkb = bytes(to_wkb(np.array([shapely.Point(place)], object))[0])
-        covers: ColumnElement[bool] = postgis.ST_Covers(area.c.geometry, tables.from_wkb(literal(wkb, LargeBinary)))
-        return covers
+        return func.ST_Covers(area.c.geometry, tables.from_wkb(literal(wkb, LargeBinary)), type_=Boolean)
 
     def refresh_areas(self) -> int:
         """Compute the areas that no commit has computed; returns how many environments were behind.

@@ -1,7 +1,7 @@
 """The background scrub: stored bytes are hashed again, slowly, over and over, by one process of several.
 
-A pass reads SQLite's pages, chunks, versions' roots, files and a sample of the cache. How far it is stands in the blob
-folder, beside the lock that one process holds; a start goes on where the last one ended.
+A pass reads SQLite's tables one by one, chunks, versions' roots, files and a sample of the cache. How far it is stands
+in the blob folder, beside the lock that one process holds; a start goes on where the last one ended.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CheckCache = Callable[[], Iterator[tuple[str, int, bool]]]
 
 @dataclass(slots=True)
 class ScrubState:
-    """How far a pass is. Times: seconds since 1970, 0.0 for never. after: the last hash of the step that was checked.
+    """How far a pass is. Times: seconds since 1970, 0.0 for never. after: what the step checked last (table, hash).
 
     found: damaged things by kind, of the pass under way; findings: of the last complete pass, and at least ``found``.
     """
@@ -123,11 +123,7 @@ class Scrub:
             kept = (self._state.completed, self._state.findings)
             self._state = ScrubState(started=time.time(), completed=kept[0], findings=kept[1])
         steps = (self._pages, self._chunks, self._versions, self._blobs, self._cache)
-        restarting: dict[Callable[[], None], Kind] = {
-            self._pages: "database",
-            self._versions: "version",
-            self._cache: "cache",
-        }
+        restarting: dict[Callable[[], None], Kind] = {self._versions: "version", self._cache: "cache"}
         while self._state.step < len(steps):
             step = steps[self._state.step]
             if step in restarting:
@@ -143,9 +139,9 @@ class Scrub:
         log.info("scrub: complete (bytes=%d, findings=%s)", state.size, state.found or "none")
 
     def _pages(self) -> None:
-        problem = self._store.check_pages()
-        if problem is not None:
-            self._note("database", "database", problem)
+        for name, size, problem in self._store.check_pages(self._state.after):
+            if not self._checked("database", name, size, problem):
+                return
 
     def _chunks(self) -> None:
         for name, size, problem in self._store.verifier().chunks(self._state.after):

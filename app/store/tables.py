@@ -9,7 +9,6 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from geoalchemy2 import Geometry
 from sqlalchemy import (
     JSON,
     BigInteger,
@@ -55,25 +54,6 @@ class Moment(TypeDecorator[datetime]):
         return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
 
 
-class _PlainGeometry(Geometry):
-    """PostGIS' column type without GeoAlchemy2's conversions of values: ours are WKB in and out."""
-
-    cache_ok = True
-
-    def bind_processor(self, dialect: Dialect) -> None:
-        """Values are bytes already."""
-
-    def result_processor(self, dialect: Dialect, coltype: object) -> None:
-        """Values stay bytes."""
-
-    def bind_expression(self, bindvalue: BindParameter[Any]) -> None:
-        """Places does it, by dialect."""
-
-    def column_expression(self, col: ColumnElement[Any]) -> ColumnElement[Any]:
-        """Places does it, by dialect."""
-        return col
-
-
 class from_wkb(FunctionElement[bytes]):  # noqa: N801 - an SQL function
     """WKB in degrees -> the column's form."""
 
@@ -105,16 +85,15 @@ def _as_wkb(element: as_wkb, compiler: Any, **kw: Any) -> str:
 class Place(TypeDecorator[bytes]):
     """A geometry in degrees (WGS 84): WKB in and out; PostGIS' type on PostgreSQL, bytes on SQLite."""
 
-    impl = _PlainGeometry
+    impl = LargeBinary
     cache_ok = True
-
-    def __init__(self) -> None:
-        super().__init__(geometry_type="GEOMETRY", srid=4326, spatial_index=False)
 
     def load_dialect_impl(self, dialect: Dialect | None) -> TypeEngine[Any]:
         """PostGIS' type on PostgreSQL alone (SQLAlchemy also asks without a dialect)."""
         if dialect is not None and dialect.name == "postgresql":
-            return _PlainGeometry(geometry_type="GEOMETRY", srid=4326, spatial_index=False)
+            from app.store.postgis import PlainGeometry
+
+            return PlainGeometry()
         return LargeBinary()
 
     def bind_expression(self, bindparam: BindParameter[Any]) -> ColumnElement[Any]:

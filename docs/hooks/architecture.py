@@ -32,7 +32,8 @@ def svg() -> str:
     rows = layers()
     height = TOP + len(rows) * (ROW + GAP) + 24 * len(FLOWS) + 24
     out = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" font-family="sans-serif" font-size="16">',
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" '
+        'font-family="sans-serif" font-size="16">',
         f'<rect width="{WIDTH}" height="{height}" rx="8" fill="#ffffff"/>',
     ]
     for k, row in enumerate(rows):

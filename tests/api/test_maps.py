@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import threading
@@ -15,6 +16,7 @@ import pytest
 import yaml
 from lxml import etree
 
+from app.pool import Cancelled, Pool, Stop
 from tests.api import samples
 from tests.api.conftest import Api, problem, running, settings_for
 
@@ -458,7 +460,6 @@ def test_cancelling_stops_the_work_unless_others_wait_for_it(tmp_path: Path, mon
 
 def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from app.convert.maps import Maps
-    from app.pool import Stop
 
     stopped = threading.Event()
 
@@ -480,3 +481,27 @@ def test_a_job_cancelled_in_another_process_is_stopped(tmp_path: Path, monkeypat
         assert not stopped.is_set()
         here.work.beat()
         assert stopped.wait(10)
+
+
+def test_coverage_does_not_wait_for_busy_workers(api: Api, farm: str) -> None:
+    """The table of content that nobody has looked at, while the only worker is at work."""
+    here = api.app.state.services
+    stop = Stop()
+    working = threading.Thread(target=_outlast, args=(here.pool, stop))
+    working.start()
+    try:
+        until = time.monotonic() + 60
+        while not here.pool.is_busy:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        rows = api.get(f"environments/{farm}/versions/3/maps").json()
+        assert any(row["state"] == "derivable" for row in rows)
+        assert here.pool.is_busy, "the worker's job ended before the table was told"
+    finally:
+        stop()
+        working.join(60)
+
+
+def _outlast(pool: Pool, stop: Stop) -> None:
+    with contextlib.suppress(Cancelled):
+        pool.run(time.sleep, 300, stop=stop)

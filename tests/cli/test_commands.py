@@ -241,6 +241,18 @@ def test_coverage_and_formats(fleetmap: Fleetmap, network: Path) -> None:
     assert "resolution" in {o["name"] for o in known["occupancy_grid"]["options"]}
 
 
+def test_parameters_of_generators_have_types_units_defaults_and_bounds(offline: Fleetmap) -> None:
+    told = offline("generate", "orchard", "--parameters")
+    assert told.status == 0
+    lines = {line.split()[0]: " ".join(line.split()) for line in told.out.splitlines() if line}
+    assert lines["row_spacing"] == "row_spacing number, 1 to 30 m 3.6 from row to row"
+    assert lines["docks"] == "docks whole number, 1 to 20 2 charging docks in the yard"
+    described = {p["name"]: p for p in offline("generate", "orchard", "--parameters", "--json").json["parameters"]}
+    assert described.keys() <= lines.keys()
+    assert described["docks"]["schema"] == {"type": "integer", "minimum": 1, "maximum": 20}
+    assert "did you mean orchard?" in offline("generate", "orchrd", "--parameters").err
+
+
 def test_tokens(fleetmap: Fleetmap, network: Path) -> None:
     assert fleetmap("import", network, "-e", "guarded").status == 0
     made = fleetmap("token", "create", "field robot", "--role", "viewer", "--environments", "guard*", "--json").json
@@ -251,6 +263,7 @@ def test_tokens(fleetmap: Fleetmap, network: Path) -> None:
     listed = fleetmap("token", "list", "--json")
     assert made["id"] in {row["id"] for row in listed.json}
     assert made["token"] not in listed.out
+    assert "ended" in fleetmap("token", "list").out.splitlines()[0].split()
     assert fleetmap("token", "delete", made["id"]).status == 0
     gone = fleetmap("versions", "guarded", "--token", made["token"])
     assert gone.status == 1

@@ -70,10 +70,17 @@ def test_unknown_names_get_a_proposal(fleetmap: Fleetmap, network: Path) -> None
         assert told.status == 1, arguments
         assert proposal in told.err, (arguments, told.err)
     for arguments, proposal in (
-        (("frmats",), "Did you mean 'formats'?"),
-        (("overlays", "acept", "proposals", "1"), "Did you mean 'accept'?"),
-        (("formats", "--jsn"), "--json"),
+        (("frmats",), "there is no command frmats (did you mean formats?)"),
+        (("convrt",), "there is no command convrt (did you mean convert?)"),
+        (("zzz",), "there is no command zzz"),
+        (("overlays", "acept", "proposals", "1"), "there is no command acept (did you mean accept?)"),
+        (("formats", "--jsn"), "there is no option --jsn (did you mean --json?)"),
+        (("check", "--jsn=1", "x"), "there is no option --jsn (did you mean --json?)"),
+        (("--versoin",), "there is no option --versoin (did you mean --version?)"),
+        (("formats", "-z"), "there is no option -z"),
         (("overlays", "list", "proposals", "--state", "pendng"), "did you mean pending?"),
+        (("jobs", "list", "--state", "rnning"), "did you mean running?"),
+        (("token", "create", "x", "--role", "edtor"), "did you mean editor?"),
     ):
         told = fleetmap(*arguments)
         assert told.status == 2, arguments

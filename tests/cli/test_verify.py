@@ -152,6 +152,21 @@ def test_a_replica_heals_everything(
     assert answers(api) == good
 
 
+def test_large_stored_files_are_streamed(other: tuple[Api, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    api, folder = other
+    blobs = api.app.state.services.store.blobs
+    data = bytes(range(256)) * 2**13
+    name = blobs.put(data)
+    monkeypatch.setattr("app.api.stored.IN_MEMORY", len(data) - 1)
+    monkeypatch.setattr(blobs, "get", None)  # nothing reads it as a whole
+    got = api.get(f"stored/blobs/{name}")
+    assert (got.content, got.headers["content-type"]) == (data, "application/octet-stream")
+    assert int(got.headers["content-length"]) == len(data)
+    path = next(folder.rglob(name))
+    path.write_bytes(data[:-1] + b"?")
+    api.problem("GET", f"stored/blobs/{name}", 404)
+
+
 def test_stored_bytes_are_for_administrators(other: tuple[Api, Path]) -> None:
     api, _ = other
     (source,) = api.get("environments/farm/versions/1/sources").json()

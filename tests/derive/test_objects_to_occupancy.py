@@ -25,6 +25,7 @@ from app.formats import Limits
 from app.model import obstacles
 from app.model.features import Features, features
 from app.model.frame import Datum, Level
+from app.model.geodesy import LocalFrame
 from app.model.grid import OccupancyGrid
 from app.model.layers import MAP, SITE, Layers, Part, PartKey, Resources
 from app.model.obstacles import OF_OSM
@@ -249,7 +250,35 @@ def test_multipolygons_are_put_together_from_their_ways() -> None:
         ("r1", None, {"kind": "building", "osm": {"members": members, "tags": tags}}),
     ]
     content = Layers({PartKey("objects", "ground", "osm"): features(rows, "local")})
-    assert occupied(grid(content)) == pytest.approx(12)
+    notes = Notes()
+    g = grid(content, notes)
+    assert occupied(g) == pytest.approx(12)
+    assert (at(g, 2, 2), at(g, 4.6, 2), at(g, 4.8, 2)) == (255, 255, 0), "the absent way may be anywhere near"
+    assert "1 object has an unknown extent (r1): their ways or nodes are missing" in notes.warnings[0].problem
+
+
+def test_ground_of_an_area_that_is_not_complete_is_unknown() -> None:
+    """Half of a house of 8 × 6 m is there, and with it the disc that a corner of a right angle would lie on."""
+    tags = {"type": "multipolygon", "building": "yes"}
+    half = shapely.LineString([(0, 0), (8, 0), (8, 6)])
+    member = [["way", 1, "outer"], ["way", 2, "outer"]]
+    ring = {"refs": [1, 2, 3, 4, 1], "missing": [3], "tags": {"building": "yes"}}
+    yard = {**ring, "tags": {"barrier": "fence"}}
+    square = [(20, 0), (20, 8), (28, 8)]
+    rows: list[Any] = [
+        ("w1", half, {"kind": "line", "osm": {"refs": [1, 2, 3], "tags": {}}}),
+        ("r1", None, {"kind": "building", "osm": {"members": member, "tags": tags}}),
+        ("w3", shapely.LineString(square), {"kind": "building", "osm": ring}),
+        ("w4", shapely.LineString([(x, y - 20) for x, y in square]), {"kind": "barrier", "osm": yard}),
+        ("w5", shapely.box(-9, -9, -8, -8), {"kind": "building"}),
+    ]
+    content = Layers({PartKey("objects", "ground", "osm"): features(rows, "local")})
+    notes = Notes()
+    g = grid(content, notes, padding=10.0)
+    assert (at(g, 6, 2), at(g, 0.2, 5.8), at(g, 8.4, 3)) == (255, 255, 255)
+    assert (at(g, -1.5, 3), at(g, 10, 3), at(g, 4, -2.3)) == (0, 0, 0)
+    assert (at(g, 24, 7), at(g, 27.8, 0.2), at(g, 24, -14)) == (255, 255, 0)
+    assert "2 objects have an unknown extent (r1, w3)" in notes.warnings[0].problem
 
 
 def test_resolution_inflation_and_padding() -> None:
@@ -391,15 +420,94 @@ def test_what_cannot_be_read_is_left_out_and_told() -> None:
 def test_bodies_without_files_are_told_apart_from_marks() -> None:
     rows: list[Any] = [
         (None, {"kind": "model", "shapes": [BOX]}),
-        (shapely.Point(0, 0), {"kind": "include", "name": "Ground Plane"}),
+        (shapely.Point(0, 0), {"kind": "include", "name": "table"}),
+        (shapely.Point(0, 0), {"kind": "model", "name": "Sun", "gazebo": {"sdf": "<include/>"}}),
         (shapely.Point(0, 0), {"kind": "light"}),
     ]
     notes = Notes()
     grid(layers(objects(*rows)), notes)
     assert {d["what"]: d["why"] for d in notes.dropped} == {
         "objects light": "nothing in a robot's way",
+        "objects model": "nothing in a robot's way",
         "objects include": "they say neither shapes nor a size: upload the files of their models with them",
     }
+
+
+FENCE = shapely.box(-20, -20, 20, 20)
+WALL = (shapely.LineString([(-10, 10), (10, 10)]), {"kind": "wall"})
+
+
+@pytest.mark.parametrize("anchor", ["local", "wgs84"])
+def test_object_of_unknown_extent_leaves_its_ground_unknown(anchor: Any) -> None:
+    """Each with free ground beyond its radius, never within."""
+    ground: list[Any] = [
+        (shapely.Point(0, 0), {"kind": "model", "name": "chair"}),
+        (shapely.Point(5, 0), {"kind": "include", "name": "table"}),
+        (shapely.Point(-5, 0), {"kind": "crate", "size": [1, 1], "pose": ["x", 0]}),
+        (shapely.Point(0, -5), {"kind": "crate", "size": [6, 4], "pose": ["x", 0]}),
+        (shapely.Point(10, -5), {"kind": "model", "shapes": [BOX], "pose": ["x", 0]}),
+        (shapely.Point(-5, -5), {"kind": "lift", "size": [1, 1], "pose": ["x", 0]}),
+        (shapely.Point(-10, -5), {"kind": "table"}),
+        (shapely.Point(-10, 0), {"kind": "table", "width": 0.2}),
+    ]
+    where = np.array([g for g, _ in (*ground, WALL)], object)
+    frame = LocalFrame(DATUM)
+    part = objects(
+        *zip(
+            where if anchor == "local" else frame.geometries_to_wgs84(where),
+            [p for _, p in (*ground, WALL)],
+            strict=True,
+        ),
+        anchor=anchor,
+    )
+    notes = Notes()
+    content = layers(part, fence=FENCE, datum=DATUM)
+    g = grid(content, notes, surroundings=2.0)
+    for x in (0, 5, -5):
+        assert (at(g, x, 0), at(g, x + 0.65, 0), at(g, x + 0.8, 0)) == (255, 255, 0)
+    assert (at(g, 3.5, -5), at(g, 3.7, -5)) == (255, 0), "half the diagonal of what it says of its size"
+    assert (at(g, 11.9, -5), at(g, 12.1, -5), at(g, -5, -5), at(g, -5, -5.8)) == (255, 0, 255, 0)
+    assert (at(g, -10, -5), at(g, -9.4, -5), at(g, -9.4, 0)) == (100, 255, 0), "of a point only the middle is known"
+    assert at(grid(content, unknown_radius=2.0), 1.9, 0) == 255
+    assert at(grid(content, inflate=0.2), 0, 0) == 255
+    (files, poses, points) = [w for w in notes.warnings if "an unknown extent" in w.problem]
+    assert files.problem.startswith("2 objects have an unknown extent (chair, table): they say neither shapes nor")
+    assert poses.problem.startswith("3 objects have an unknown extent (o2, o3, o5): pose")
+    assert points.problem.startswith("1 object has an unknown extent (o6): they are points")
+    assert ("unknown_radius", 0.7) in [(t["what"], t["value"]) for t in notes.template]
+
+
+def test_objects_of_unknown_extent_leave_the_other_ground_free() -> None:
+    """Also where they are all that there is, on a floor and on the blank grid of a fence."""
+    chair = (shapely.Point(0, 0), {"kind": "model"})
+    notes = Notes()
+    g = grid(layers(objects((FENCE, {"kind": "floor"}), chair)), notes)
+    assert (at(g, 0.6, 0), at(g, 0.8, 0)) == (255, 0)
+    assert any("is free but the ground around objects of unknown extent" in w.problem for w in notes.warnings)
+    content = layers(objects(chair), fence=FENCE)
+    with pytest.raises(MissingLayer, match="upload the files of their models"):
+        grid(content)
+    notes = Notes()
+    blank = location_to_occupancy(content, BlankParameters(), notes).grids()[PartKey("occupancy", "ground", MAP)]
+    assert (at(blank, 0.6, 0), at(blank, 0.8, 0)) == (255, 0)
+    assert "1 object has an unknown extent" in notes.warnings[0].problem
+    notes = Notes()
+    assert not grid(layers(objects((FENCE, {"kind": "floor"}), chair)), notes, unknown_radius=100.0).counts()["free"]
+    assert "or ask with a smaller unknown_radius" in notes.warnings[-1].problem
+
+
+def test_object_without_a_place_is_warned_of() -> None:
+    notes = Notes()
+    rows: list[Any] = [WALL, (None, {"kind": "building", "name": "barn"}), (None, {"kind": "model"})]
+    grid(layers(objects(*rows)), notes)
+    (warning,) = notes.warnings
+    assert "2 objects have no known place (barn, o2)" in warning.problem
+
+
+def test_box_without_a_geometry_stands_at_its_pose() -> None:
+    g = grid(layers(objects((None, {"kind": "crate", "size": [2, 1], "pose": [3, 4]}))))
+    assert occupied(g) == pytest.approx(2)
+    assert at(g, 3.9, 4.4) == 100
 
 
 def test_what_keeps_a_world_from_being_a_grid_is_told() -> None:
@@ -526,6 +634,10 @@ def read(*paths: Path) -> Layers:
     return told.layers(None)
 
 
+def xy_of(listed: list[dict[str, Any]], scale: float) -> Any:
+    return [(one["x"] * scale, -one["y"] * scale) for one in listed]
+
+
 @pytest.mark.parametrize(
     ("name", "level", "walls", "floor"),
     [
@@ -568,8 +680,12 @@ def test_a_real_building_is_its_walls_and_floors(
     apart = ~shapely.contains(cabins, middles)
     assert (g.cells[apart & (away > 0.05 * math.sqrt(2) + 0.036 + 0.001)] != 100).all()
     inside = shapely.contains(floors, middles)
-    assert (g.cells[inside & (g.cells != 100)] == 0).all()
+    models = shapely.MultiPoint(xy_of(one.get("models", []), scale))
+    near = np.zeros(inside.shape) + np.inf if models.is_empty else shapely.distance(middles, models)
+    assert (g.cells[inside & (g.cells != 100) & (near > 0.74)] == 0).all()
+    assert (g.cells[(near < 0.69) & (g.cells != 100)] == 255).all()
     assert (g.cells[~inside & (g.cells != 100)] == 255).all()
+    assert g.counts()["free"] > 0.5 * (inside & (g.cells != 100)).sum(), "rooms stay mostly free"
 
 
 def test_the_walls_of_robast_sim_are_on_its_ros_map(shared: Path) -> None:

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from app import derive, formats, parameters
 from app.bundle import Hints, Known, read
-from app.derive import Notes, occupancy_to_voxels, voxels_to_occupancy
+from app.derive import Notes, occupancy_to_imagery, occupancy_to_voxels, voxels_to_occupancy
 from app.derive.occupancy_to_topology import Parameters, network, occupancy_to_topology
 from app.errors import Ambiguous, CannotConvert, Invalid, MissingLayer, NotFound
 from app.formats import Limits, ReadContext, WriteContext
@@ -35,6 +35,7 @@ from app.model.grid import (
     unknown_grey,
     without_unknown_grey,
 )
+from app.model.imagery import Picture
 from app.model.layers import MAP, NETWORK, Layers, PartKey
 
 METHODS = ("skeleton", "roadmap", "voronoi")
@@ -578,6 +579,12 @@ def test_no_part_of_the_server_takes_the_grey_of_unknown_for_seen() -> None:
     )
     assert back.counts()["free"] == free
     assert "taken as unknown" in notes.warnings[0].problem
+
+    (picture,) = occupancy_to_imagery.occupancy_to_imagery(
+        layers, occupancy_to_imagery.Parameters(), notes
+    ).parts.values()
+    assert isinstance(picture, Picture)
+    assert ((picture.pixels[::-1, :, 3] == 0) == (grey & (cells != OCCUPIED) | (cells == UNKNOWN))).all()
 
     ((_, whole),) = (
         complete_grid.complete_grid(layers, complete_grid.Options(confidence=0.0), Source(1, "complete_grid"), notes)

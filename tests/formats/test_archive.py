@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.errors import BadUpload, TooLarge, UnreadableFile, UnsafeArchive
-from app.formats import Limits, _archive
+from app.formats import Limits, _archive, all_formats
 from app.model.names import bad_name
 
 FILES = {"doc.kml": b"<kml/>" * 50, "images/é.png": bytes(range(256)), "empty.txt": b"", "inner.zip": b""}
@@ -241,6 +241,18 @@ def test_large_members_stay_whole():
     """More than one piece in and out, also where the packed data ends long before its output does."""
     files = {"zeros": bytes(5_000_000), "noise": bytes(range(256)) * 20_000, "ones": b"1" * (2**20)}
     assert _archive.unpack(_archive.pack(files), Limits()) == files
+
+
+BINARY = (".zip", ".kmz", ".gz", ".bz2", ".pbf", ".bt", ".ot", ".las", ".laz", ".pcd", ".ply")
+
+
+def test_texts_of_all_formats_are_bound_as_texts():
+    endings = {end for known in all_formats().values() for end in known.extensions}
+    texts = sorted(end for end in endings if not end.endswith((*BINARY, *_archive._IMAGES)))
+    assert ".site.ron" in texts
+    for end in texts:
+        with pytest.raises(TooLarge, match="for a text of"):
+            _archive.unpack(zipped((f"map{end}", bytes(17 * 2**20))), Limits())
 
 
 BUILDERS: list[Callable[[], bytes]] = [lambda: b"", lambda: b"PK", lambda: b"PK\x05\x06" + bytes(17), lambda: b"<kml/>"]

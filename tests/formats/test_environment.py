@@ -484,14 +484,66 @@ def test_a_package_gives_back_its_very_layers_until_a_map_of_it_is_edited() -> N
     for wrong in ({"shape": [-1, 2]}, {"shape": [2**40, 2**20]}, {"type": "|O"}, {"file": "../x"}):
         parts_ = [p | {"cells": array | wrong} if p["layer"] == "occupancy" else p for p in top["parts"]]
         damaged.append({**top, "parts": parts_})
+    for member, wrong in (
+        ("transform", [0.1, 0, 1e19, 0, -0.1, 0]),
+        ("crs", "nowhere"),
+        ("crs", "+proj=longlat +nadgrids=/etc/hosts"),
+        ("crs", "EPSG:9999999"),
+    ):
+        damaged.append({**top, "parts": [p | {member: wrong} if p["layer"] == "imagery" else p for p in top["parts"]]})
+    damaged += [{**top, "parts": [{**part, "local": [[True, True]]} for part in top["parts"]]}]
     files_of = next(part for part in top["parts"] if part["layer"] == "resources")["files"]
     for name in ("../../evil.stl", "/etc/evil.stl", "a\\b", "a\nb", ""):
         named = {"files": {name: files_of["a/b.bin"]}}
         damaged.append({**top, "parts": [p | named if p["layer"] == "resources" else p for p in top["parts"]]})
-    for wrong in (b"{", b"[]" * 10**5, *map(orjson.dumps, damaged)):
+    plain = orjson.dumps({**top, "levels": [["2", 4711]]})
+    numbers = [plain.replace(b"4711", text) for text in (b"NaN", b"1e999", b'"nan"', b"18446744073709551616")]
+    for wrong in (b"{", b"[]" * 10**5, *numbers, *map(orjson.dumps, damaged)):
         with pytest.raises(BadUpload) as caught:
             told({**files, content: wrong})
         assert [p.file for p in caught.value.problems] == [content], wrong[:100]
+
+
+@pytest.mark.parametrize("root", ["", "yard/"])
+def test_files_that_are_no_maps_do_not_make_the_maps_of_a_package_count(root: str) -> None:
+    files = {f"{root}{name}": data for name, data in written(offline_layers())[0].items()}
+    content = f"{root}config/fleet_map/content.json"
+    mac = b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X        "
+    added = {
+        f"{root}.DS_Store": b"\x00\x00\x00\x01Bud1",
+        f"{root}config/fleet_map/.DS_Store": b"\x00\x00\x00\x01Bud1",
+        f"__MACOSX/{root}config/location/._fence.kml": mac,
+        f"__MACOSX/{root}config/metric/map/._map.yaml": mac,
+        f"{root}README.md": b"# A yard\n",
+        f"{root}LICENSE": b"MIT License\n\nCopyright (c) 2024 Somebody\n",
+        f"{root}config/notes.txt": b"to do\n",
+        f"{root}config/empty.kml": b"",
+    }
+    plain, with_more = told(files), told({**files, **added})
+    assert hashes(with_more.parts) == hashes(plain.parts)
+    assert [(p.file, p.problem) for p in with_more.warnings] == [
+        (f"{root}config/notes.txt", "no format reads this file: it is kept as a source")
+    ]
+    used = {name for name, use in with_more.files.items() if use.used}
+    assert used == files.keys() | {f"{root}config/fleet_map/.DS_Store"}
+    assert "Somebody" in str(with_more.credit(PartKey("occupancy", "ground", "map")))
+    other = told({**files, **added, f"{root}config/location/more.kml": b"<kml/>"})
+    assert f"the maps of the package count: {root}config/location/more.kml was added" in [
+        p.problem.removeprefix("not used, ") for p in other.warnings if p.file == content
+    ]
+
+
+def test_what_macos_packs_beside_a_drawing_is_no_drawing(shared: Path) -> None:
+    drawing = next(path for path in sorted((shared / "data/kml").rglob("*.kml"))).read_bytes()
+    files = {"a.kml": drawing, "__MACOSX/._a.kml": b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X        "}
+    for name in (None, "kml"):
+        both = told(files, name)
+        assert hashes(both.parts) == hashes(told({"a.kml": drawing}, name).parts)
+        assert not both.files["__MACOSX/._a.kml"].used
+
+
+def offline_layers() -> Layers:
+    return Layers({PartKey("occupancy", "ground", "map"): grid()}, DATUM, (Level(),))
 
 
 def hashes(parts: Mapping[PartKey, Part]) -> dict[PartKey, bytes]:

@@ -1001,3 +1001,15 @@ def test_a_models_file_is_chosen_by_its_config() -> None:
     library = _sdf.Library(folder(SAMPLES / "yard"))
     assert library.model_file("models/crate") == "models/crate/model.sdf"
     assert library.model_file("models/none") is None
+
+
+def test_unknown_elements_are_named_but_those_of_plugins() -> None:
+    box = "<geometry><box><size>1 1 1</size></box></geometry>"
+    model = (
+        f"<model name='a'><static>true</static><link name='l'><colision name='c'>{box}</colision>"
+        "<plugin name='p' filename='f'><anything/></plugin></link></model>"
+    )
+    text = f"<sdf version='1.7'><world name='w'>\n{model}</world></sdf>"
+    (warning,) = told({"w.world": text.encode()}).warnings
+    assert warning.problem == "unknown elements, kept without effect: <colision> (did you mean collision?)"
+    assert warning.line == 2

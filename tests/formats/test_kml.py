@@ -780,3 +780,20 @@ def test_columns_of_many_items_are_quick_to_write():
         return time.perf_counter() - start
 
     assert seconds(10_000) < 40 * max(seconds(1_000), 0.02)
+
+
+def test_unknown_elements_are_named_with_their_number() -> None:
+    placemark = (
+        "<Placemark><nam>a</nam><gx:drawOrder>1</gx:drawOrder><x:own/><ExtendedData><free/></ExtendedData>"
+        "<description><![CDATA[<b>x</b>]]></description><Point><coordinates>1,2</coordinates></Point></Placemark>"
+    )
+    spaces = (
+        'xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2" '
+        'xmlns:x="http://example.com/x"'
+    )
+    text = f"<kml {spaces}><Document>\n{placemark}\n{placemark}<gx:zzz/><!-- <yyy/> --></Document></kml>"
+    for data in (text.encode(), ('<?xml version="1.0" encoding="UTF-16"?>' + text).encode("utf-16")):
+        _, context = load(data)
+        (warning,) = context.warnings
+        assert warning.problem == ("unknown elements, kept without effect: <nam> (did you mean name?) (2 times), <zzz>")
+        assert warning.line == 2

@@ -873,3 +873,26 @@ def test_a_node_twice_within_a_way_is_no_edge() -> None:
     found = network(read(xml(f'{nodes}<way id="3">{refs}<tag k="highway" v="path"/></way>{twice}'), told))
     assert sorted(found.edges()) == [("n1", "n2"), ("n2", "n1")]
     assert ["that segment is no edge" in p.problem for p in told.warnings] == [True, True]
+
+
+def test_values_that_are_not_understood_are_named_with_their_number() -> None:
+    nodes = "".join(f'<node id="{k}" lat="50.00{k}" lon="7.0"/>' for k in range(1, 4))
+    tree = '<node id="9" lat="50.1" lon="7.0"><tag k="natural" v="tree"/><tag k="height" v="tall"/></node>'
+    ways = ""
+    for k, tags in enumerate(
+        (
+            {"highway": "service", "maxspeed": "RO:urban", "width": "2.5 m", "lanes": "2"},
+            {"highway": "service", "maxspeed": "RO:urban", "width": "about 2"},
+            {"highway": "service", "maxspeed": "none", "surface": "odd", "name": "x"},
+            {"railway": "rail", "maxspeed": "fast"},
+        )
+    ):
+        said = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+        ways += f'<way id="{k}"><nd ref="1"/><nd ref="2"/>{said}</way>'
+    context = ReadContext()
+    read(f'<osm version="0.6">{nodes}{tree}{ways}</osm>'.encode(), context)
+    assert [(p.where, p.problem) for p in context.warnings] == [
+        ("way 0", "the tag maxspeed='RO:urban' is not understood: kept without effect (2 times)"),
+        ("way 1", "the tag width='about 2' is not understood: kept without effect"),
+        ("node 9", "the tag height='tall' is not understood: kept without effect"),
+    ]

@@ -257,6 +257,13 @@ def test_what_is_wrong_is_refused_with_its_place(changes: dict[str, Any], reason
     assert caught.value.problems[0].file == "ward.site.json"
 
 
+@pytest.mark.parametrize(("latitude", "good"), [(-80.1, False), (-80.0, True), (84.0, True), (84.1, False)])
+def test_places_beyond_the_zones_of_utm_are_refused_by_the_editor(latitude: float, good: bool) -> None:
+    files = ward(properties__geographic_offset__anchor=[latitude, 0.0])
+    told = [p for p in formats.check(FORMAT, files) if p.where == "properties.geographic_offset.anchor"]
+    assert [p.level for p in told] == ([] if good else ["error"])
+
+
 def test_lanes_without_an_anchor_are_kept_for_the_way_back() -> None:
     lane = {"anchors": [14, 999], "graphs": "All"}
     layers, told = read(ward(navigation__guided__lanes__136=lane))

@@ -21,7 +21,7 @@ from app.errors import CannotGenerate, Invalid, MissingLayer
 from app.generate import _site
 from app.generate._site import Site, SiteOptions
 from app.model.features import Features, features
-from app.model.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from app.model.grid import FREE, OCCUPIED, UNKNOWN, UNKNOWN_GREY, OccupancyGrid, packed_cells, unknown_grey
 from app.model.layers import Layers, PartKey
 from tests.api.conftest import Api
 from tests.generate.looks import digest, make, world
@@ -323,6 +323,22 @@ def test_masks_are_left_alone_unless_named() -> None:
     assert [k.name for k in made.parts] == ["map"]
     _, made, _ = disturbed(before, grid="keepout")
     assert [k.name for k in made.parts] == ["keepout"]
+
+
+def test_free_cells_of_unknowns_grey_stay_as_they_are() -> None:
+    """Nothing new stands on ground that nobody has seen, and no noise frees its edge."""
+    cells = room().cells.copy()
+    grey = np.zeros(cells.shape, bool)
+    grey[:, 121:] = cells[:, 121:] == FREE
+    properties = {UNKNOWN_GREY: packed_cells(grey)}
+    before = Layers({PartKey("occupancy"): OccupancyGrid(cells, 0.05, free_thresh=0.25, properties=properties)})
+    after, _, _ = disturbed(before, obstacles=40, speckle=0.2, erode=0.9, severity=1.0)
+    assert (grid(after).cells != cells)[:, :100].any()
+    assert (grid(after).cells[grey] == FREE).all()
+    left = unknown_grey(grid(after))
+    assert left is not None
+    assert (left == grey).all()
+    assert (grid(after).cells[[0, -1], 130:-2] == OCCUPIED).all()
 
 
 def test_again_and_again() -> None:

@@ -242,6 +242,32 @@ def test_connection_is_kept_after_a_complete_body(api: Api) -> None:
                 assert b"connection: close" not in answer
 
 
+ASK = b"GET /openapi.json HTTP/1.1\r\nHost: x\r\n"
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_what_is_no_request_breaks_no_answer_before_it(api: Api, number: int) -> None:
+    with connect(api.url) as line:
+        line.sendall((ASK + b"\r\n") * number + b"nonsense\r\n\r\n" + bytes(100_000))
+        answers, _ = read_to_end(line)
+    expected = api.http.get("/openapi.json").content
+    for _ in range(number):
+        head, _, answers = answers.partition(b"\r\n\r\n")
+        assert head.startswith(b"HTTP/1.1 200 ")
+        assert answers.startswith(expected)
+        answers = answers[len(expected) :]
+    assert answers == b""
+
+
+def test_half_a_request_behind_an_answer_ends_the_connection(api: Api) -> None:
+    with connect(api.url) as line:
+        line.sendall(ASK + b"\r\n" + ASK + b"Transfer-Encoding: chunked\r\n\r\nnonsense\r\n")
+        assert b"HTTP/1.1 400 " not in read_to_end(line)[0]
+    with connect(api.url) as line:
+        line.sendall(ASK + b"Transfer-Encoding: chunked\r\n\r\nnonsense\r\n")
+        assert read_to_end(line)[0].startswith(b"HTTP/1.1 400 ")
+
+
 def test_slow_bodies_and_heads_end(api: Api) -> None:
     bearer = f"Authorization: Bearer {ADMIN}\r\n"
     with connect(api.url) as body, connect(api.url) as head, connect(api.url) as blank:

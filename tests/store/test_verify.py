@@ -7,6 +7,7 @@ import json
 import pickle
 import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -130,16 +131,41 @@ def test_the_scrub_finds_damage_goes_on_after_a_stop_and_tells_its_age(store: St
     assert read_state(store.blob_dir) == state, "the next pass is not due yet"
 
 
-def test_a_scrub_that_is_stopped_again_and_again_counts_once(
+def test_the_scrub_checks_sqlite_table_by_table_with_pauses(
     sqlite_store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sqlite_store, "check_pages", lambda: "a page is bad")
-    for stopped in (True, True, True, False):
-        scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9)
-        if stopped:
-            scrub._stopped.set()
+    """Pauses hold no connection; a stop between two tables loses nothing, and damage counts once."""
+    real, checked = sqlite_store._database.integrity, list[str]()
+
+    def integrity(limit: int, *, table: str | None = None) -> str | None:
+        checked.append(str(table))
+        return "a page is bad" if table == "blob" else real(limit, table=table)
+
+    monkeypatch.setattr(sqlite_store._database, "integrity", integrity)
+    tables, size = sqlite_store._database.tables()
+    assert {"sqlite_master", "blob", "chunk"} <= set(tables)
+    assert sqlite_store._database.file is not None
+    assert size <= sqlite_store._database.file.stat().st_size + 2**22  # what the write-ahead log has yet to add
+    waited: list[float] = []
+
+    def wait(seconds: float | None = None) -> bool:
+        assert sqlite_store._database.engine.pool.checkedout() == 0  # type: ignore[attr-defined]
+        waited.append(seconds or 0.0)
+        return False
+
+    for _ in range(len(tables)):
+        scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=size // len(tables))
+        scrub._stopped.wait = wait  # type: ignore[method-assign]
+        scrub._stopped.set()
         scrub.pass_if_due()
+    assert checked == tables
+    assert len(waited) >= len(tables)
+    assert min(waited) >= 0.9
+    Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9).pass_if_due()
+    assert checked == tables
     assert read_state(sqlite_store.blob_dir).findings == {"database": 1}
+    with pytest.raises(DatabaseDamaged, match="a page is bad"):
+        sqlite_store._database.check()
 
 
 def test_a_scrub_passes_over_what_cannot_be_read(
@@ -166,9 +192,10 @@ def test_a_scrub_survives_a_defect(
     monkeypatch.setattr("app.store.scrub.POLL_SECONDS", 0.01)
     errors = [ValueError("a defect"), *[OSError(errno.EIO, "refused", "/srv/data")] * 2]
 
-    def check_pages() -> None:
+    def check_pages(after: str) -> Iterator[tuple[str, int, str | None]]:
         if errors:
             raise errors.pop(0)
+        return iter(())
 
     monkeypatch.setattr(sqlite_store, "check_pages", check_pages)
     scrub = Scrub(sqlite_store, lambda: iter(()), every=3600, rate=10**9, delay=0.0)

@@ -1,0 +1,91 @@
+"""What trials of derivations have found, by content: in memory, and in a file for the next start.
+
+A line of the file is the SHA-256 of its rest and ``[key, hindrance]`` as JSON; of two lines of a key the later counts.
+A damaged line is passed over, so that its trial is made again, and where the disk refuses there is only the memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import threading
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from uuid import uuid4
+
+import orjson
+
+from app.convert.recipe import Hindrance
+
+MOST = 10_000
+"""Trials that are remembered; the file is written anew at twice as many lines."""
+
+
+class Trials:
+    """The outcome of trials by key: a Hindrance, or None where all steps work. Thread-safe."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._guard = threading.Lock()
+        self._found: dict[str, Hindrance | None] = {}
+        self._lines = 0
+        for key, found in self._read():
+            self._put(key, found)
+
+    def __getitem__(self, key: str) -> Hindrance | None:
+        """KeyError where it was not tried."""
+        with self._guard:
+            return self._found[key]
+
+    def add(self, key: str, found: Hindrance | None, *, lasting: bool) -> None:
+        """Remember an outcome. lasting: also for the next start."""
+        with self._guard:
+            self._put(key, found)
+            if not lasting:
+                return
+            self._lines += 1
+            with contextlib.suppress(OSError):
+                if self._lines > 2 * MOST:
+                    self._rewrite()
+                else:
+                    with self._path.open("ab", buffering=0) as file:  # one write: whole lines, whoever else writes
+                        file.write(_line(key, found))
+
+    def _put(self, key: str, found: Hindrance | None) -> None:
+        self._found.pop(key, None)  # the latest last: the oldest goes first
+        self._found[key] = found
+        while len(self._found) > MOST:
+            self._found.pop(next(iter(self._found)))
+
+    def _read(self) -> Iterator[tuple[str, Hindrance | None]]:
+        try:
+            lines = self._path.read_bytes().splitlines()
+        except OSError:
+            return
+        self._lines = len(lines)
+        for line in lines:
+            digest, _, text = line.partition(b" ")
+            if digest != _digest(text):
+                continue
+            with contextlib.suppress(TypeError, ValueError):  # of a release that knows other fields
+                key, found = orjson.loads(text)
+                yield key, None if found is None else Hindrance(**found)
+
+    def _rewrite(self) -> None:
+        temporary = self._path.with_suffix(f".{uuid4().hex}")
+        try:
+            temporary.write_bytes(b"".join(_line(key, found) for key, found in self._found.items()))
+            temporary.replace(self._path)
+        finally:
+            temporary.unlink(missing_ok=True)
+        self._lines = len(self._found)
+
+
+def _line(key: str, found: Hindrance | None) -> bytes:
+    text = orjson.dumps([key, None if found is None else asdict(found)])
+    return _digest(text) + b" " + text + b"\n"
+
+
+def _digest(text: bytes) -> bytes:
+    return hashlib.sha256(text).hexdigest().encode()

@@ -1,0 +1,72 @@
+"""What the start of a server on SQLite loads, and what runs beside it."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.cli import serving
+from app.errors import Unavailable
+from app.pool import WARM
+
+LATE = ("geoalchemy2", "alembic", "httpx", "numba", "cv2", "scipy")
+
+
+def loaded(statement: str) -> list[str]:
+    """Which modules of LATE are there after a statement in an interpreter of its own."""
+    script = f"import sys\n{statement}\nprint(*[name for name in {LATE!r} if name in sys.modules])"
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=root, check=True)
+    return done.stdout.split()
+
+
+@pytest.mark.parametrize("statement", ["import app.cli.serving, app.main", f"import {', '.join(WARM)}"])
+def test_start_loads_nothing_that_only_others_need(statement: str) -> None:
+    assert loaded(statement) == []
+
+
+def test_postgresql_loads_its_part_when_it_is_used() -> None:
+    compiled = (
+        "from sqlalchemy.dialects import postgresql\n"
+        "from app.store import tables\n"
+        "print(tables.area.c.geometry.type.compile(postgresql.dialect()))"
+    )
+    assert loaded(compiled) == ["geometry(GEOMETRY,4326)", "geoalchemy2"]
+
+
+@pytest.fixture
+def collecting() -> Iterator[None]:
+    yield
+    gc.enable()
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+@pytest.mark.usefixtures("collecting")
+def test_workers_are_prepared_beside_the_start(workers: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    def check(_: Any) -> None:
+        done.append("check")
+        raise Unavailable("the database is away")
+
+    monkeypatch.setattr(serving, "start_beside", lambda: done.append("beside"))
+    monkeypatch.setattr(serving, "check", check)
+    with pytest.raises(Unavailable, match="away"):
+        serving.serve(data_dir=str(tmp_path), port="0", workers=workers)
+    # Servers of several workers are processes of their own, which have their own conversion workers.
+    assert done == (["beside", "check"] if workers == "1" else ["check"])
+    assert gc.isenabled()
+
+
+@pytest.mark.usefixtures("collecting")
+def test_application_collects_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLEETMAP_DATA_DIR", str(tmp_path))
+    gc.disable()
+    serving.application()
+    assert gc.isenabled()

@@ -1,0 +1,158 @@
+"""Trials of derivations are remembered over a restart, and a damaged memory is none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app import derive
+from app.convert import maps as module
+from app.convert import trials
+from app.convert.maps import Maps
+from app.convert.recipe import Chain, Hindrance
+from app.convert.trials import Trials
+from app.formats import Limits
+from app.pool import WorkerDied
+from tests.api import samples
+from tests.api.conftest import Api
+
+FAILED = Hindrance("occupancy_to_topology", "name one\nwith grid=", choose=True)
+
+
+def test_outcomes_last(tmp_path: Path) -> None:
+    first = Trials(tmp_path / "trials")
+    first.add("works", None, lasting=True)
+    first.add("fails", Hindrance("a", "first"), lasting=True)
+    first.add("fails", FAILED, lasting=True)
+    first.add("for now", FAILED, lasting=False)
+    assert first["for now"] == FAILED
+    again = Trials(tmp_path / "trials")
+    assert again["works"] is None
+    assert again["fails"] == FAILED
+    for key in ("for now", "never"):
+        with pytest.raises(KeyError):
+            again[key]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda raw: raw[:-30],
+        lambda raw: raw.replace(b"null", b"true"),
+        lambda raw: raw.replace(b"works", b"fails"),
+        lambda raw: b"\x00" * len(raw),
+        lambda raw: raw.replace(b"\n", b" "),
+        lambda raw: b"\xff\xfe\n" + raw[3:],
+    ],
+)
+def test_damaged_lines_are_passed_over(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+    path = tmp_path / "trials"
+    Trials(path).add("works", None, lasting=True)
+    path.write_bytes(damage(path.read_bytes()))
+    again = Trials(path)
+    for key in ("works", "fails"):
+        with pytest.raises(KeyError):
+            again[key]
+    again.add("works", None, lasting=True)
+    again.add("next", None, lasting=True)
+    assert Trials(path)["next"] is None
+
+
+def test_fields_of_another_release_are_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "trials"
+    for text in (b'["key",{"other":1}]', b'["key"]', b"7"):
+        path.write_bytes(trials._digest(text) + b" " + text + b"\n")
+        with pytest.raises(KeyError):
+            Trials(path)["key"]
+
+
+def test_memory_and_file_stay_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trials, "MOST", 5)
+    path = tmp_path / "trials"
+    known = Trials(path)
+    for number in range(100):
+        known.add(str(number), None, lasting=True)
+        assert len(path.read_bytes().splitlines()) <= 10
+    again = Trials(path)
+    assert again["99"] is None
+    with pytest.raises(KeyError):
+        again["90"]
+    assert [p.name for p in tmp_path.iterdir()] == ["trials"]
+
+
+def test_disk_that_refuses_leaves_the_memory(tmp_path: Path) -> None:
+    (tmp_path / "trials").mkdir()
+    known = Trials(tmp_path / "trials")
+    known.add("works", None, lasting=True)
+    assert known["works"] is None
+
+
+class Runs:
+    """Runs jobs at once and counts them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def __call__(self, function: Callable[..., Any], *args: Any, **_: Any) -> Any:
+        self.count += 1
+        return function(*args)
+
+
+def open_maps(api: Api, folder: Path, run: Any) -> Maps:
+    return Maps(api.app.state.services.store, run, folder, Limits())
+
+
+@pytest.fixture
+def version(api: Api, fresh: Callable[[], str]) -> Any:
+    env = fresh()
+    api.post("environments", {"name": env})
+    api.upload(env, samples.grid())
+    return api.app.state.services.store.version(env, 1)
+
+
+def test_coverage_after_a_restart_tries_nothing(api: Api, version: Any, tmp_path: Path) -> None:
+    run, again = Runs(), Runs()
+    before = open_maps(api, tmp_path, run).coverage(version)
+    assert run.count
+    assert open_maps(api, tmp_path, again).coverage(version) == before
+    assert again.count == 0
+
+
+def test_coverage_after_damage_tries_again(api: Api, version: Any, tmp_path: Path) -> None:
+    run, again = Runs(), Runs()
+    before = open_maps(api, tmp_path, run).coverage(version)
+    path = tmp_path / "trials"
+    path.write_bytes(path.read_bytes().replace(b"null", b"nul1"))
+    assert open_maps(api, tmp_path, again).coverage(version) == before
+    assert 0 < again.count <= run.count
+
+
+def test_dead_workers_are_no_lasting_verdict(api: Api, version: Any, tmp_path: Path) -> None:
+    def die(*_: Any, **__: Any) -> Any:
+        raise WorkerDied("out of memory")
+
+    run = Runs()
+    dead = open_maps(api, tmp_path, die).coverage(version)
+    well = open_maps(api, tmp_path, run).coverage(version)
+    assert run.count
+    assert dead != well
+
+
+def test_verdict_of_a_model_does_not_last(version: Any) -> None:
+    step = derive.all_derivations()["imagery_to_objects"].step()
+    plain = Chain((step,), ())
+    assert module._is_lasting(plain)
+    with_model = derive.with_values([step], {"model": "trees"})
+    assert not module._is_lasting(Chain(with_model, ()))
+    assert module._trial_key(version, plain) != module._trial_key(version, Chain(with_model, ()))
+
+
+def test_trials_do_not_wait_for_maps(api: Api, version: Any, tmp_path: Path) -> None:
+    def busy(*_: Any, **__: Any) -> Any:
+        raise AssertionError("it waits for a worker that makes maps")
+
+    maps = Maps(api.app.state.services.store, busy, tmp_path, Limits(), run_trial=Runs())
+    assert any(line["state"] == "derivable" for line in maps.coverage(version))
