@@ -23,7 +23,6 @@ from app.formats import all_formats
 from app.main import create_app
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text()
 TEXTS = (".py", ".md", ".toml", ".yaml", ".yml", ".svg", ".sh", ".service", ".env", ".js", "Makefile", "Dockerfile")
 SKIPPED = frozenset({".git", ".venv", "build", "data", "dist", "node_modules"})
 
@@ -59,6 +58,16 @@ def pages(site: Path) -> Mapping[str, str]:
         out[path.relative_to(site).as_posix()] = " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
     assert len(out) > len(all_formats())
     return out
+
+
+def test_readme_is_short() -> None:
+    assert (ROOT / "README.md").stat().st_size <= 10_000
+
+
+def test_links_of_texts_at_the_top_lead_somewhere() -> None:
+    for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
+        for target in re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / name).read_text()):
+            assert (ROOT / target).is_file(), f"{name}: {target}"
 
 
 def words(page: str) -> set[str]:
@@ -210,7 +219,7 @@ def test_no_text_names_a_path_of_a_machine() -> None:
 def test_no_text_names_a_document_that_is_not_in_the_project() -> None:
     own = {path.name for path in ROOT.rglob("*.md") if not SKIPPED & set(path.relative_to(ROOT).parts)}
     own |= {f"{name}.md" for name in all_formats()}
-    own |= {"grammar.md", "extensions.md", "LIF.md"}  # standards: RON, LIF
+    own |= {"grammar.md", "extensions.md", "LIF.md", "NOTICE.md"}  # of RON, of LIF, and of a test's upload
     for path, text in texts():
         named = set(re.findall(r"(?<![\w/*.-])(?:[\w.-]+/)*([\w-]+\.md)\b", text))
         assert named <= own, f"{path} names {', '.join(sorted(named - own))}"

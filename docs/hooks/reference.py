@@ -63,12 +63,10 @@ def on_config(config: MkDocsConfig) -> None:
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> None:
-    """Add the formats' pages, and pictures."""
+    """Add the formats' pages, and the picture of the packages."""
     for known in all_formats().values():
         files.append(File.generated(config, f"{FORMATS}/{known.name}.md", content=format_page(known)))
     files.append(File.generated(config, "images/architecture.svg", content=architecture.svg()))
-    picture = Path(inspect.getfile(generate)).with_name("sites.png")
-    files.append(File.generated(config, "images/sites.png", abs_src_path=str(picture)))
 
 
 def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> str:
