@@ -16,7 +16,7 @@ SYNC := UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) sync --frozen 
 ROBOT := app/__init__.py app/errors.py app/event_types.py app/events/__init__.py app/events/login.py \
   app/events/messages.py app/model/__init__.py app/model/frame.py app/model/names.py app/signing.py app/agent app/cli
 
-.PHONY: run test lint bench chaos fuzz figures install install-dev clean
+.PHONY: run test lint docs bench chaos fuzz figures install install-dev clean
 
 run: install
 	@$(BIN)/fleetmap serve --demo $(ARGS)
@@ -32,6 +32,11 @@ lint: install-dev
 	$(BIN)/vermin --target=3.10- --violations --no-tips --exclude compression --exclude compression.zstd $(ROBOT)
 	$(BIN)/lint-imports
 	UV_SYSTEM_CERTS=true UV_PROJECT_ENVIRONMENT=$(VENV) $(UV) lock --check --no-python-downloads
+
+# The documentation, into build/docs: warnings are errors, links and anchors are checked.
+docs: install-dev
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs --quiet build --strict --config-file .mkdocs.yml $(ARGS)
+	@echo "build/docs/index.html"
 
 bench: install-dev
 	@$(BIN)/python -m tests.bench $(ARGS)

@@ -1,6 +1,6 @@
 """A bundle of files -> layers: which file is which map, what a folder says, and which of two files is believed.
 
-Contract, section 8 "Uploads". Only files that tell the same thing compete: ``X`` wins over ``X_autogen``, and of two
+Only files that tell the same thing compete: ``X`` wins over ``X_autogen``, and of two
 files that tell one network, the richer format wins; the others stay sources. Nothing read is thrown away.
 """
 

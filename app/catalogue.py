@@ -11,7 +11,7 @@ from app.model.layers import CONTENT_LAYERS, Layer
 
 
 def describe_format(known: Format) -> dict[str, Any]:
-    """Describe a format in the contract's words.
+    """Describe a format as JSON.
 
     ``information`` is what a file of it gives, itself or by derivation.
     """
@@ -33,7 +33,7 @@ def describe_formats() -> list[dict[str, Any]]:
 
 
 def describe_derivation(known: Derivation) -> dict[str, Any]:
-    """Describe a derivation in the contract's words."""
+    """Describe a derivation as JSON."""
     return {
         "id": known.name,
         "title": known.title,

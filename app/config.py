@@ -1,7 +1,7 @@
 """The settings: environment variables ``FLEETMAP_*``, a ``.env`` file, or flags of ``fleetmap serve``.
 
-Nothing is read at import: a factory makes ``Settings()`` and passes it on. Every setting is described here and in the
-README; every field of ``app.formats.Limits`` is the setting ``FLEETMAP_MAX_<FIELD>``.
+Nothing is read at import: a factory makes ``Settings()`` and passes it on. Every setting is described here, for the
+documentation too; every field of ``app.formats.Limits`` is the setting ``FLEETMAP_MAX_<FIELD>``.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class Problem:
     level: Literal["error", "warning"] | None = None
 
     def as_dict(self) -> dict[str, str | int]:
-        """The problem without its empty members, in the contract's words."""
+        """The problem as JSON, without its empty members."""
         members = {"file": self.file, "line": self.line, "where": self.where, "problem": self.problem}
         members |= {"level": self.level}
         return {name: value for name, value in members.items() if value is not None}

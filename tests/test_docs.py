@@ -1,44 +1,227 @@
-"""What is not documented fails here: each setting, format and command stands in the README."""
+"""The documentation builds without a warning, and what exists is in it. What is not documented fails here."""
 
 from __future__ import annotations
 
+import dataclasses
+import html
+import logging
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.main import get_command
 
-from app.cli.commands import build
+from app import derive, generate
+from app.api.problems import STATUS, status_of
+from app.cli.commands import ALIASES, build
 from app.config import Settings
+from app.event_types import EVENT_TYPES
+from app.events import bus, messages
 from app.formats import all_formats
+from app.main import create_app
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text()
+TEXTS = (".py", ".md", ".toml", ".yaml", ".yml", ".svg", ".sh", ".service", ".env", ".js", "Makefile", "Dockerfile")
+SKIPPED = frozenset({".git", ".venv", "build", "data", "dist", "node_modules"})
 
 
-@pytest.mark.parametrize("name", sorted(Settings.model_fields))
-def test_every_setting_stands_in_the_readme_with_its_meaning(name: str) -> None:
-    line = next((row for row in README.splitlines() if row.startswith(f"| `FLEETMAP_{name.upper()}` |")), "")
-    assert line, f"FLEETMAP_{name.upper()} is not in the README's table of settings"
-    assert str(Settings.model_fields[name].description) in line
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built pages. A warning of MkDocs (a broken link or anchor, a page that no menu lists) is a failure."""
+    from mkdocs.commands.build import build as build_pages
+    from mkdocs.config import load_config
+    from mkdocs.exceptions import Abort
+
+    folder = tmp_path_factory.mktemp("site")
+    said: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
+    log = logging.getLogger("mkdocs")
+    log.addHandler(handler)
+    try:
+        build_pages(load_config(str(ROOT / ".mkdocs.yml"), site_dir=str(folder), strict=True))
+    except Abort:
+        pytest.fail("\n".join(said))
+    finally:
+        log.removeHandler(handler)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pages(site: Path) -> Mapping[str, str]:
+    """Path below the site -> the words of the page's content."""
+    out = {}
+    for path in site.rglob("*.html"):
+        body = path.read_text().partition("<article")[2].partition("</article>")[0]
+        out[path.relative_to(site).as_posix()] = " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
+    assert len(out) > len(all_formats())
+    return out
+
+
+def test_readme_is_short() -> None:
+    assert (ROOT / "README.md").stat().st_size <= 10_000
+
+
+def test_links_of_texts_at_the_top_lead_somewhere() -> None:
+    for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"):
+        for target in re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / name).read_text()):
+            assert (ROOT / target).is_file(), f"{name}: {target}"
+
+
+def words(page: str) -> set[str]:
+    """The words of a page without punctuation at their ends."""
+    return {word.strip(".,;:()[]¶") for word in page.split()}
+
+
+@pytest.fixture(scope="module")
+def schema(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    settings = Settings(_env_file=None, data_dir=tmp_path_factory.mktemp("data"), zenoh_mode="off")  # type: ignore[call-arg]
+    described: dict[str, Any] = create_app(settings).openapi()
+    return described
+
+
+def test_pages_load_nothing_from_other_hosts(site: Path) -> None:
+    loading = re.compile(r"<(?:script|img|iframe|source)\b[^>]*\bsrc=[\"']?(?:https?:)?//|@import|url\([\"']?https?:")
+    for path in site.rglob("*"):
+        if path.suffix in (".html", ".css", ".svg"):
+            text = path.read_text()
+            assert not loading.search(text), path
+            for link in re.findall(r"<link\b[^>]*>", text):
+                assert "canonical" in link or not re.search(r"href=[\"']?(?:https?:)?//", link), link
+
+
+def test_every_setting_is_documented(pages: Mapping[str, str]) -> None:
+    page = pages["reference/settings.html"]
+    for name, field in Settings.model_fields.items():
+        assert f"FLEETMAP_{name.upper()}" in words(page)
+        assert field.description, name
+        assert "".join(field.description.replace("`", "").split())[:60] in "".join(page.split()), name
 
 
 @pytest.mark.parametrize("name", sorted(all_formats()))
-def test_every_format_stands_in_the_readme(name: str) -> None:
-    assert f"`{name}`" in README
+def test_every_format_has_a_page(pages: Mapping[str, str], name: str) -> None:
+    known = all_formats()[name]
+    page = pages[f"reference/formats/{name}.html"]
+    assert known.title in page
+    assert name in words(pages["reference/formats.html"])
+    for file in known.files:
+        assert file in page
+    options = (known.write_options if known.write else None, known.read_options if known.read else None)
+    for field in (f for cls in options if cls for f in dataclasses.fields(cls)):
+        assert field.name in words(page)
+        assert field.metadata["doc"], f"{name}: {field.name} does not say what it means"
+    assert ("Rules of its consumers" in page) == (known.check is not None)
 
 
-def test_every_command_stands_in_the_readme() -> None:
-    names = sorted(get_command(build()).commands)  # type: ignore[attr-defined]
-    assert names
-    for name in names:
-        assert f"fleetmap {name}" in README, f"the README does not mention `fleetmap {name}`"
+@pytest.mark.parametrize("kind", ["derivations", "generators"])
+def test_every_derivation_and_generator_is_documented(pages: Mapping[str, str], kind: str) -> None:
+    known: Mapping[str, Any] = derive.all_derivations() if kind == "derivations" else generate.all_generators()
+    page = pages[f"reference/{kind}.html"]
+    for name, one in known.items():
+        assert name in words(page)
+        for field in dataclasses.fields(one.parameters):
+            assert field.name in words(page), f"{name}: {field.name}"
+            assert field.metadata["doc"], f"{name}: {field.name} does not say what it means"
 
 
-def test_no_word_of_a_machine_or_a_workplace_stands_in_the_project() -> None:
-    for path in ROOT.rglob("*"):
-        relative = path.relative_to(ROOT)
-        if path.suffix not in (".py", ".md", ".toml", ".yaml") or relative.parts[0].startswith((".", "data")):
+def test_every_route_is_documented(pages: Mapping[str, str], schema: dict[str, Any]) -> None:
+    page = pages["reference/http.html"]
+    for path, item in schema["paths"].items():
+        name = path.removeprefix("/maps/{env}/")
+        if name in all_formats():
+            assert f"reference/formats/{name}.html" in pages
             continue
-        text = path.read_text(errors="replace")
+        for method in item:
+            assert f"{method.upper()} {path} ¶" in page, f"{method} {path}"
+    for name in schema["components"]["schemas"]:
+        assert f"{name} ¶" in page
+
+
+def test_every_event_is_documented(pages: Mapping[str, str]) -> None:
+    """``tests/api/test_event_payloads.py`` compares the payloads with what the server sends."""
+    for kind in EVENT_TYPES:
+        assert f"{kind} ¶" in pages["reference/events.html"]
+
+
+def test_every_command_is_documented(pages: Mapping[str, str]) -> None:
+    page = pages["reference/cli.html"]
+
+    def check(name: str, command: Any) -> None:
+        assert f"{name} ¶" in page
+        for option in (o for p in command.params for o in p.opts if o.startswith("--") and not p.hidden):
+            assert option in words(page), f"{name} {option}"
+        for child in getattr(command, "commands", {}):
+            check(f"{name} {child}", command.commands[child])
+
+    root: Any = get_command(build())
+    for name in sorted(root.commands):
+        if name not in ALIASES:
+            check(f"fleetmap {name}", root.commands[name])
+
+
+def test_every_metric_is_documented(pages: Mapping[str, str]) -> None:
+    named = {
+        n for p in (ROOT / "app").rglob("*.py") for n in re.findall(r"[\"'](fleetmap_[a-z_]+)[\"'],", p.read_text())
+    }
+    named -= {"fleetmap_agent", "fleetmap_ros", "fleetmap_heads"}
+    assert {"fleetmap_head", "fleetmap_requests"} <= named
+    for name in named:
+        assert {name, f"{name}_total"} & words(pages["reference/metrics.html"]), name
+
+
+def test_every_problem_is_documented(pages: Mapping[str, str]) -> None:
+    for cls, (status, title) in STATUS.items():
+        _, _, kind = status_of(cls.__new__(cls))
+        row = pages["reference/errors.html"].partition(f" {kind} ")[2][:80]
+        assert row.split()[0] == str(status), kind
+        assert title in row, kind
+
+
+def test_every_zenoh_key_is_documented(pages: Mapping[str, str]) -> None:
+    class Recorder:
+        """A session that notes the keys that are declared on it."""
+
+        def __init__(self) -> None:
+            self.keys: list[str] = []
+
+        def __getattr__(self, _: str) -> Any:
+            return lambda *arguments, **__: self.keys.append(str(arguments[0])) if arguments else self
+
+    session: Any = Recorder()
+    own = bus.Bus(bus.BusOptions(), ask=Any, explain=Any, on_status=Any, on_alive=Any)  # type: ignore[arg-type]
+    own._declare(session)
+    own.close()
+    keys = [*session.keys, messages.events_key("fleetmap", "*"), messages.status_key("fleetmap", "*", "*")]
+    assert len(keys) > 6
+    documented = {re.sub(r"{[a-z]+}", "*", word) for word in words(pages["reference/zenoh.html"])}
+    for key in keys:
+        assert key.replace("/**", "/*") in documented, key
+
+
+def texts() -> Iterator[tuple[Path, str]]:
+    """The project's own texts: (path below the root, content)."""
+    for path in sorted(ROOT.rglob("*")):
+        relative = path.relative_to(ROOT)
+        if SKIPPED & set(relative.parts) or not path.is_file() or "samples" in relative.parts:
+            continue
+        if path.name.endswith(TEXTS):
+            yield relative, path.read_text(errors="replace")
+
+
+def test_no_text_names_a_path_of_a_machine() -> None:
+    for path, text in texts():
         for word in ("/" + "work/", "/" + "root/"):
-            assert word not in text, f"{relative} names a path of a machine"
+            assert word not in text, f"{path} names a path of a machine"
+
+
+def test_no_text_names_a_document_that_is_not_in_the_project() -> None:
+    own = {path.name for path in ROOT.rglob("*.md") if not SKIPPED & set(path.relative_to(ROOT).parts)}
+    own |= {f"{name}.md" for name in all_formats()}
+    own |= {"grammar.md", "extensions.md", "LIF.md", "NOTICE.md"}  # of RON, of LIF, and of a test's upload
+    for path, text in texts():
+        named = set(re.findall(r"(?<![\w/*.-])(?:[\w.-]+/)*([\w-]+\.md)\b", text))
+        assert named <= own, f"{path} names {', '.join(sorted(named - own))}"
+        for phrase in ("the contract", "house rules", "design page"):
+            assert path == Path("tests/test_docs.py") or phrase not in text.lower(), f"{path} speaks of {phrase!r}"

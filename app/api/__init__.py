@@ -1,4 +1,4 @@
-"""The HTTP interface (contract, sections 3, 7 and 8): one module for each noun.
+"""The HTTP interface: one module for each noun.
 
 ``guard`` stands in front (token, bodies, errors), ``maps.Server`` before it (repeated requests from memory);
 ``problems`` knows the status of every error, ``schemas`` the shapes and examples.

@@ -187,7 +187,7 @@ def _problem(error: BaseException) -> dict[str, Any]:
 
 
 def as_dict(job: Job) -> dict[str, Any]:
-    """The job in the contract's words; one whose process is gone has failed."""
+    """The job as JSON; one whose process is gone has failed."""
     state, problem, detail = job.state, job.problem, job.detail
     if state in ("queued", "running") and datetime.now(UTC) - job.updated > LOST_AFTER:
         state, detail = "failed", "the server was restarted"

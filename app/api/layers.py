@@ -1,4 +1,4 @@
-"""Canonical content (contract, section 8): vector layers as GeoJSON, grids and pictures as PNG, or JSON about them."""
+"""Canonical content: vector layers as GeoJSON, grids and pictures as PNG, or JSON about them."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ class Download:
 
 
 class Client:
-    """A server that speaks the contract. Every method raises Refused where it says no or nothing."""
+    """The server's HTTP interface. Every method raises Refused where it says no or nothing."""
 
     def __init__(self, server: str | None = None, token: str | None = None) -> None:
         self.server = (server or os.environ.get("FLEETMAP_SERVER") or DEFAULT_SERVER).rstrip("/")

@@ -236,7 +236,7 @@ class Maps:
                 continue  # it is remembered: the next recipe goes another way, or says that there is none
 
     def report(self, recipe: Recipe) -> dict[str, Any]:
-        """What was raw, derived, filled in and dropped: the contract's report, for this version."""
+        """The report for this version: what was raw, derived, filled in and dropped."""
         if recipe.members:
             clashes = {**making.empty_report(recipe.format), "dropped": self.make(recipe).report["dropped"]}
             members = [(member.folder, self.report(member.recipe)) for member in recipe.members]

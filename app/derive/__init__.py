@@ -101,7 +101,7 @@ class Step:
         return frozenset((*self.needs, *self.also))
 
     def as_dict(self) -> dict[str, Any]:
-        """The step in the contract's words, with all its parameters."""
+        """The step as JSON, with all its parameters."""
         defaults = {p["name"]: p["default"] for p in parameters.describe(all_derivations()[self.name].parameters)}
         values = {**defaults, **dict(self.given)}
         looked = {"also": list(self.also)} if self.also else {}

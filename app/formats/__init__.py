@@ -213,7 +213,7 @@ bends of edges from elsewhere become nodes, and stay ones."""
 class Format:
     """A file format. Only what is declared here is known of it elsewhere.
 
-    name: the contract's id. files: the names it is served as. media_types: of the served files, in that order.
+    name: its id. files: the names it is served as. media_types: of the served files, in that order.
     carries: layers it can hold. needs: what writing takes. detect: is this file (name, content) the main file of such
     a map; sure formats first (``rank``). companions: further files of the upload that belong to a main file.
     family: format family of its objects (``osm``, ``kml`` …). drawing: its lines and polygons may be meant for any

@@ -1,4 +1,4 @@
-"""Numbers as text, the same on every machine (contract: rounded to 1e-9 m or 1e-12 degrees before printing)."""
+"""Numbers as text, the same on every machine: rounded to 1e-9 m or 1e-12 degrees before printing."""
 
 from __future__ import annotations
 

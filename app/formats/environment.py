@@ -11,7 +11,8 @@ that are there; as in the template those of maps that are missing are empty. The
 ``complete`` adds what derivations can make of it.
 
 ``config/fleet_map`` holds the stored layers exactly (``_content``): a package whose maps nobody has touched gives back
-the very environment, and in one that was edited the maps count.
+the very environment, and in one that was edited the maps count. Added files that no format reads (a README,
+``.DS_Store``) are no edit.
 
 Every map in it is another format's: reading is what an upload of the folder is (``app.bundle``), and writers come from
 ``WriteContext.make``.

@@ -1,4 +1,4 @@
-"""The contract's edits (put, delete, cells) -> changes of the store, checked against the version they build on.
+"""Edits (put, delete, cells) -> changes of the store, checked against the version they build on.
 
 A feature may be put back as ``GET …/layers/{layer}`` shows it: what was not edited in it stays exactly as it is stored,
 also where the answer rounded or converted it. A feature that is edited keeps its anchor, whatever ``crs`` its new place
@@ -120,7 +120,7 @@ class _Session:
         self._known = {level.name for level in base.levels}
 
     def apply(self, change: Mapping[str, Any]) -> None:
-        """One edit of the contract: op put, delete or cells."""
+        """One edit: op put, delete or cells."""
         operation = change.get("op")
         known = {
             "put": {"op", "layer", "level", "name", "feature", "crs"},

@@ -71,7 +71,7 @@ class Upload:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a change. body: the contract's version JSON; ``version`` in it is null for a dry run."""
+    """What became of a change. body: the version as JSON; ``version`` in it is null for a dry run."""
 
     status: Literal["created", "unchanged", "dry_run", "replayed"]
     version: Version | None
@@ -130,7 +130,7 @@ class Ingest:
         if_match: str | None = None,
         idempotency: str | None = None,
     ) -> Outcome:
-        """The contract's edits -> one version. Raises Invalid (dangling edges, unknown ids), StaleParent, Conflict."""
+        """Edits -> one version. Raises Invalid (dangling edges, unknown ids), StaleParent, Conflict."""
         if _deeper_than(MAX_DEPTH, changes):
             reason = f"nested deeper than {MAX_DEPTH} lists and objects"
             raise Invalid(f"the changes are {reason}", [Problem(reason, where="changes")])

@@ -63,7 +63,7 @@ class Datum:
             object.__setattr__(self, name, float(value) + 0.0)
 
     def as_dict(self) -> dict[str, float]:
-        """The datum in the contract's words."""
+        """The datum as JSON."""
         return {
             "latitude": self.latitude,
             "longitude": self.longitude,

@@ -1,7 +1,7 @@
 """WGS 84 to the local frame and back: the only module that knows the ellipsoid.
 
-The local frame is the transverse Mercator projection centred on the datum with scale 1, turned by the datum's heading
-(contract, section 1). PROJ's ``tmerc`` (Poder/Engsager) is exact to nanometres at these distances.
+The local frame is the transverse Mercator projection centred on the datum with scale 1, turned by the datum's heading.
+PROJ's ``tmerc`` (Poder/Engsager) is exact to nanometres at these distances.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ def clean_problem(problem: Problem) -> Problem:
 
 
 def check_environment_name(name: str) -> str:
-    """Invalid unless the contract allows the name."""
+    """Raise Invalid for a name that is not allowed."""
     if not ENVIRONMENT_NAME.fullmatch(name) or name in RESERVED:
         raise Invalid(
             f"an environment cannot be called {name[:80]!r}: use 1 to 63 of a-z, 0-9, _ and -, starting with a "

@@ -35,7 +35,7 @@ class FeatureChanges:
         return {"added": len(self.added), "changed": len(self.changed), "deleted": len(self.deleted)}
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract's words."""
+        """The difference as JSON."""
         return {
             "added": self.added,
             "changed": [{"id": i, "fields": fields(self.before[i], self.after[i])} for i in self.changed],

@@ -106,7 +106,7 @@ class Source:
     used: bool = True
 
     def as_dict(self) -> dict[str, Any]:
-        """The source in the contract's words."""
+        """The source as JSON."""
         return {
             "name": self.name,
             "size": self.size,
@@ -265,7 +265,7 @@ class Version:
         return out
 
     def as_dict(self) -> dict[str, Any]:
-        """The version in the contract's words."""
+        """The version as JSON."""
         return {
             "environment": self.environment,
             "version": self.number,
@@ -384,7 +384,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One row of the log. sequence: of the environment, without gaps. body: the contract's event.
+    """One row of the log. sequence: of the environment, without gaps. body: the event as JSON.
 
     position: of the whole log, growing by one, so that one reader can follow all environments.
     """

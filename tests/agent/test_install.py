@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from app.agent import trust
-from tests.agent.conftest import ROOT, Start
+from tests.agent.conftest import ROOT
 from tests.agent.conftest import whole as whole_map
 from tests.api.conftest import ADMIN, Api
 
@@ -206,41 +206,3 @@ def test_router_addresses_are_told_for_who_asks() -> None:
     assert router_for("tcp/router.farm:7447", "tcp/0.0.0.0:1", "x") == "tcp/router.farm:7447"
     assert router_for("", "tcp/0.0.0.0:7447", "bad host\n") == ""
     assert router_for("", "", "x") == ""
-
-
-def test_the_three_commands_of_the_readme(api: Api, robot: Start, tmp_path: Path) -> None:
-    from tests.cli.test_readme import blocks
-
-    section = blocks("A robot follows a change in three commands")[0]
-    kml = (ROOT / "README.md").read_text().split("<<'KML'\n")[1].split("\nKML\n")[0]
-    (tmp_path / "network.kml").write_text(kml)
-    datum = {"latitude": 53.2686, "longitude": -0.5245}
-    api.post("environments", {"name": "my-farm", "datum": datum})
-    api.upload("my-farm", {"network.kml": kml.encode()}, layer="topology")
-    section = section.replace("# 2.", "until grep -q 'version 2' said 2> /dev/null; do sleep 0.1; done\n# 2.")
-    (tmp_path / "bin").mkdir()
-    (tmp_path / "bin" / "fleetmap").write_text(f'#!/bin/sh\nexec {sys.executable} -m app.cli "$@"\n')
-    (tmp_path / "bin" / "fleetmap").chmod(0o755)
-    script = f"""
-        set -euo pipefail
-        {section}
-        for n in $(seq 150); do [ -s said ] && grep -q 'version 3' said && break; sleep 0.1; done
-        kill $!; wait
-        """
-    told = subprocess.run(
-        ["bash", "-c", script],
-        cwd=tmp_path,
-        env={
-            "PATH": f"{tmp_path}/bin:/usr/bin:/bin",
-            "PYTHONPATH": str(ROOT),
-            "FLEETMAP_SERVER": api.url,
-            "FLEETMAP_TOKEN": ADMIN,
-            "HOME": str(tmp_path),
-        },
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert "version 3: objects topology" in (tmp_path / "said").read_text(), told.stdout + told.stderr
-    assert whole_map(tmp_path / "maps")["version"] == 3

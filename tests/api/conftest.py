@@ -86,7 +86,7 @@ def parts(files: Files) -> list[tuple[str, tuple[str, bytes]]]:
 
 
 def problem(answer: httpx.Response) -> dict[str, Any]:
-    """The answer's problem: RFC 9457 with the contract's members and no others."""
+    """The answer's problem: RFC 9457 with its members, `errors` and no others."""
     assert answer.headers["content-type"] == "application/problem+json", answer.text[:500]
     body: dict[str, Any] = answer.json()
     assert set(body) <= {"type", "title", "status", "detail", "errors"}, body

@@ -1,4 +1,4 @@
-"""Licences and credits of sources: kept with the parts, carried into formats with a place for them (contract, 8)."""
+"""Licences and credits of sources: kept with the parts, carried into formats with a place for them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Canonical content over HTTP (contract, section 8), diffs and transforms."""
+"""Canonical content over HTTP, diffs and transforms."""
 
 from __future__ import annotations
 

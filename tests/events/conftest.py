@@ -40,7 +40,7 @@ def client_config(port: int, **more: Any) -> zenoh.Config:
 
 
 class Listener:
-    """A robot's ear: an advanced subscriber with history and recovery, as the contract recommends."""
+    """A robot's ear: an advanced subscriber with history and recovery, as `docs/reference/zenoh.md` recommends."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
         self.events: list[dict[str, Any]] = []

@@ -125,7 +125,7 @@ def test_a_format_is_not_made_from_nothing(name: str) -> None:
 
     known = formats.get_format(name)
     if known.write is None:
-        pytest.fail(f"{name} is not served: say so in the contract's table first")
+        pytest.fail(f"{name} is not served: say so in CHANGELOG.md first")
     with pytest.raises((MissingLayer, CannotConvert)) as caught:
         chain(known, Stock(frozenset(), False), known.write_options())
     assert "supply" in caught.value.detail or "needs" in caught.value.detail

@@ -1,4 +1,4 @@
-"""The README's picture of all sites: ``python -m tests.generate.pictures`` draws it anew."""
+"""The picture of all sites in docs: ``python -m tests.generate.pictures`` draws it anew."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from app.model.features import Features
 from app.model.imagery import Picture, displayed
 from app.model.layers import Layers
 
-SHEET = Path(generate.__file__).with_name("sites.png")
+SHEET = Path(__file__).resolve().parents[2] / "docs" / "images" / "sites.png"
 SEED = 7
 TILE = (300, 220)
 COLUMNS = 4

@@ -1,6 +1,6 @@
 """Holes of 2 m × 2 m cut into real grids: what complete_grid calls free is free, and straight walls go on.
 
-``python -m tests.generate.test_completion`` measures all grids, for the figures in the README.
+``python -m tests.generate.test_completion`` measures all grids, for the figures in docs/how-to/generate-sites.md.
 """
 
 from __future__ import annotations

@@ -266,7 +266,7 @@ def test_the_last_events_of_all_environments(store: Store):
     assert last(9, 99, position=2) == [("busy", 1), ("busy", 2)]
 
 
-def test_events_tell_what_the_contract_says(store: Store):
+def test_events_have_the_documented_members(store: Store):
     store.create_environment("farm", author="ann", datum=DATUM)
     made = save(store, "farm", Replace(GRID, grid()), Replace(TOPOLOGY, network(5)))
     then = datetime(2031, 5, 1, 4, tzinfo=UTC)

@@ -82,6 +82,6 @@ def test_the_sample_parameters_are_parameters() -> None:
     body = yaml.safe_load((ros.HERE / "config" / "fleetmap_agent.yaml").read_text())
     settings = Settings.from_parameters(body["fleetmap_agent"]["ros__parameters"])
     assert settings.formats == ("occupancy_grid", "nav2_route")
-    readme = (TOP / "README.md").read_text()
+    page = (TOP / "docs" / "how-to" / "nav2.md").read_text()
     for name in Settings.__dataclass_fields__:
-        assert f"`{name}`" in readme, f"the README does not name the parameter {name}"
+        assert f"`{name}`" in page, f"docs/how-to/nav2.md does not name the parameter {name}"

@@ -102,7 +102,7 @@ class Names:
 
     @classmethod
     def from_environment(cls, variables: Mapping[str, str]) -> Names:
-        """The names of the environment variables that the README lists."""
+        """The names of the environment variables that docs/how-to/nav2.md lists."""
         given = {
             "map_server": variables.get("FLEETMAP_NAV2_MAP_SERVER"),
             "keepout_server": variables.get("FLEETMAP_NAV2_KEEPOUT_SERVER"),

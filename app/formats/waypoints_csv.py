@@ -1,0 +1,164 @@
+"""waypoints_csv: waypoints as a table, one in a row: ``name,x,y,yaw`` or ``name,latitude,longitude,yaw``.
+
+The first row names the columns, in any order; ``yaw`` may be absent or empty. ``x`` and ``y`` are metres in the local
+frame, ``latitude`` and ``longitude`` degrees WGS 84, ``yaw`` radians, counter-clockwise from the local x axis. UTF-8,
+separated by commas, texts in quotes where they need them (RFC 4180).
+
+Each row is a node without edges; its id is its name. ``yaw`` is its orientation. Further columns are texts under
+``properties.waypoints_csv``, and come back. A map has the coordinates that the upload had, else metres.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import shapely
+
+from app.errors import MissingDatum, TooLarge
+from app.formats import Files, Format, Needs, ReadContext, WriteContext, _text, register
+from app.formats._network import (
+    checked_name,
+    identifier,
+    joined,
+    known_document,
+    own,
+    quaternion,
+    refuse,
+    said_yaw,
+    some,
+    without_repeats,
+)
+from app.model.features import Properties, from_columns, unique_ids
+from app.model.frame import MAX_METRES, Anchor
+from app.model.layers import NETWORK, Layers, PartKey
+
+NAME = "waypoints_csv"
+METRES, DEGREES = ("x", "y"), ("latitude", "longitude")
+_DECIMAL = re.compile(r"\s*[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,4})?\s*")
+LIMITS = {"x": MAX_METRES, "y": MAX_METRES, "latitude": 90.0, "longitude": 180.0, "yaw": 1e6}
+
+
+def read(files: Files, context: ReadContext) -> Layers:
+    """The rows as nodes. Raises UnreadableFile naming the line and column."""
+    if not context.wants("topology"):
+        return Layers()
+    data = files[context.main or next(iter(files))]
+    if len(data) > context.limits.text_bytes:
+        raise TooLarge(f"the table has {len(data)} bytes; the limit for a text is {context.limits.text_bytes}")
+    rows = _rows(data.decode("utf-8-sig"))
+    header = [word.strip() for word in next(rows, ("", []))[1]]
+    axes = _axes(header)
+    if axes is None or without_repeats(header):
+        refuse("the first row must name the columns, each once: name, and x and y or latitude and longitude", "line 1")
+    names: list[str] = []
+    places: list[tuple[float, ...]] = []
+    properties: list[Properties] = []
+    for where, row in rows:
+        if len(row) != len(header):
+            refuse(f"has {len(row)} values, the first row names {len(header)} columns", where)
+        cells = dict(zip(header, row, strict=True))
+        names.append(checked_name(cells.pop("name").strip(), f"{where}, name"))
+        places.append(tuple(_number(cells.pop(axis), axis, where) for axis in axes))
+        node: dict[str, object] = {"kind": "node", "name": names[-1]}
+        mine: dict[str, object] = {}
+        if yaw := cells.pop("yaw", "").strip():
+            mine["yaw"] = angle = _number(yaw, "yaw", where)
+            node["orientation"] = quaternion(angle)
+        mine |= {column: text for column, text in cells.items() if text}
+        properties.append({**node, NAME: mine})
+    if again := without_repeats(names):
+        context.warn(f"{len(again)} names stand twice or more and got a number: {some(again)}")
+    xy = np.array(places, np.float64).reshape(-1, 2)
+    points = np.asarray(shapely.points(xy if axes == METRES else xy[:, ::-1]), object).reshape(-1)
+    anchor: Anchor = "local" if axes == METRES else "wgs84"
+    document = {NAME: {"columns": header}}
+    part = from_columns(unique_ids(map(identifier, names)), points, properties, anchor, document)
+    return Layers({PartKey("topology", context.level, NETWORK): part})
+
+
+def _rows(text: str) -> Iterator[tuple[str, list[str]]]:
+    """(where it is, cells) of each row that is not empty."""
+    rows = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        for row in rows:
+            if row:
+                yield f"line {rows.line_num}", row
+    except csv.Error as error:
+        refuse(f"no CSV: {error}", f"line {rows.line_num}")
+
+
+def _axes(header: Sequence[str]) -> tuple[str, str] | None:
+    """Which columns are the coordinates; None where this is no such table."""
+    found = [axes for axes in (METRES, DEGREES) if set(axes) <= set(header)]
+    return found[0] if "name" in header and len(found) == 1 else None
+
+
+def _number(text: str, column: str, where: str) -> float:
+    if not _DECIMAL.fullmatch(text):
+        refuse(f"must be a number, is {text[:60]!r}", f"{where}, {column}")
+    value = float(text)
+    if not abs(value) <= LIMITS[column]:
+        refuse(f"must be within ±{LIMITS[column]:g}, is {text[:60]}", f"{where}, {column}")
+    return value
+
+
+def write(layers: Layers, context: WriteContext) -> dict[str, bytes]:
+    """``waypoints.csv``: the nodes of all networks, by name. MissingDatum where degrees and metres meet without one."""
+    net = joined(layers, context)
+    columns = known_document(layers, NAME).get("columns")
+    columns = columns if isinstance(columns, list) and _axes(list(map(str, columns))) else ["name", *METRES, "yaw"]
+    axes = _axes(columns) or METRES
+    context.drop("edges", len(net.edges), "a table of waypoints has none")
+    context.drop("altitudes of nodes", sum(bool(n.z) for n in net.nodes), "waypoints are flat")
+    if len(set(net.levels)) > 1:
+        context.drop("levels of nodes", len(net.nodes), "all networks are one table")
+    places = np.array([(n.x, n.y) for n in net.nodes], np.float64).reshape(-1, 2)
+    decimals = _text.METRES
+    if axes == DEGREES:
+        if layers.frame is None:
+            raise MissingDatum("waypoints in degrees need a datum: give the environment one")
+        places, decimals = layers.frame.to_wgs84(places)[:, ::-1], _text.DEGREES
+    lost = 0
+    out = io.StringIO(newline="")
+    table = csv.writer(out, lineterminator="\n")
+    table.writerow(columns)
+    for node, place in sorted(zip(net.nodes, places.tolist(), strict=True), key=lambda one: one[0].id):
+        p, mine = node.properties, own(node.properties, NAME)
+        angle = said_yaw(mine.get("yaw"), p.get("orientation"))
+        cells = {key: str(value) for key, value in mine.items()}
+        cells |= dict(zip(axes, _text.numbers(place, decimals), strict=True))
+        cells |= {"name": str(p.get("name") or node.id), "yaw": "" if angle is None else _text.number(angle, 12)}
+        table.writerow([cells.get(str(column), "") for column in columns])
+        lost += bool(p.keys() - {"kind", "name", "orientation", NAME})
+        context.drop("orientations of nodes", angle is not None and "yaw" not in columns, "the table has no column yaw")
+    context.drop("attributes of nodes", lost, "the table has no columns for them")
+    return {"waypoints.csv": out.getvalue().encode()}
+
+
+def detect(name: str, data: bytes) -> bool:
+    """A first row that names such columns."""
+    if not name.lower().endswith(".csv"):
+        return False
+    first = data[:4096].decode("utf-8-sig", "replace").partition("\n")[0]
+    return _axes([word.strip() for word in first.split(",")]) is not None
+
+
+register(
+    Format(
+        name=NAME,
+        title="Waypoints (CSV)",
+        files=("waypoints.csv",),
+        media_types=("text/csv",),
+        carries=frozenset({"topology"}),
+        detect=detect,
+        read=read,
+        write=write,
+        needs=Needs(one_of=(frozenset({"topology"}),)),
+        family=NAME,
+        extensions=(".csv",),
+    )
+)

@@ -1,0 +1,632 @@
+"""The pages of ``docs/reference`` that the code declares: an MkDocs hook.
+
+``<!-- reference: NAME -->`` in a page is replaced by what ``BLOCKS[NAME]`` makes, and each format gets its own page. So
+a page holds only what the code cannot say, and what the code says stands nowhere else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import importlib
+import inspect
+import itertools
+import re
+import sys
+import tempfile
+import types
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import architecture
+import declared
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+from prometheus_client.metrics import MetricWrapperBase
+from pydantic import SecretStr
+from typer.main import get_command
+
+from app import derive, generate
+from app.api import problems
+from app.api.access import AtLeast
+from app.api.answers import API
+from app.api.metrics import Metrics, _Heads, _Scrubs
+from app.cli import commands
+from app.config import Settings, format_size
+from app.derive import Derivation
+from app.errors import FleetMapError
+from app.formats import Format, all_formats
+from app.generate import Generator
+from app.main import create_app
+from app.store import encode, tree
+
+FORMATS = "reference/formats"
+LIMITS = ("ge", "gt", "le")
+"""What pydantic calls bounds."""
+
+MARKER = re.compile(r"^<!-- reference: ([a-z-]+) -->$", re.MULTILINE)
+METHODS = ("get", "post", "put", "patch", "delete")
+EVERYWHERE = {"400", "401", "403", "408", "413", "415", "422", "429", "503", "507"}
+"""Statuses that most calls share: ``docs/reference/errors.md`` explains them once."""
+
+
+# --- MkDocs ----------------------------------------------------------------------------------------------------------
+def on_config(config: MkDocsConfig) -> None:
+    """Add the formats' pages to the navigation, below the page that lists them."""
+    pages = [{name: f"{FORMATS}/{name}.md"} for name in all_formats()]
+    _extend(config.nav or [], pages)
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> None:
+    """Add the formats' pages, and the picture of the packages."""
+    for known in all_formats().values():
+        files.append(File.generated(config, f"{FORMATS}/{known.name}.md", content=format_page(known)))
+    files.append(File.generated(config, "images/architecture.svg", content=architecture.svg()))
+
+
+def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> str:
+    """Fill in what the code declares."""
+
+    def fill(found: re.Match[str]) -> str:
+        if found[1] not in BLOCKS:
+            raise PluginError(f"{page.file.src_uri}: there is no generated block {found[1]!r}: {', '.join(BLOCKS)}")
+        return BLOCKS[found[1]]()
+
+    return MARKER.sub(fill, markdown)
+
+
+def _extend(nav: list[Any], pages: Sequence[Mapping[str, str]]) -> None:
+    for item in nav:
+        for section in item.values() if isinstance(item, dict) else ():
+            if isinstance(section, list):
+                _extend(section, pages)
+                if f"{FORMATS}.md" in section:
+                    section.extend(pages)
+
+
+# --- Markdown --------------------------------------------------------------------------------------------------------
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table; a column that is empty in all rows is left out, and so is a table without rows."""
+    every = [list(row) for row in rows]
+    kept = [k for k in range(len(head)) if any(row[k] for row in every)]
+    lines = [[head[k] for k in kept], ["---"] * len(kept), *([_cell(row[k]) for k in kept] for row in every)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n" if every else ""
+
+
+def _cell(text: str) -> str:
+    return " ".join(re.sub(r"\n+ *- ", "<br>", text).replace("|", "\\|").split())
+
+
+def code(value: object) -> str:
+    """A value as code."""
+    return f"`{value}`"
+
+
+def codes(values: Iterable[object]) -> str:
+    """Values as code, separated by commas."""
+    return ", ".join(map(code, values))
+
+
+def plain(text: str) -> str:
+    """A text of the code's as Markdown: what stands in backticks is code, nothing else is markup."""
+    pieces = re.split(r"(``.+?``|`[^`\n]+`)", text, flags=re.DOTALL)
+    return "".join(p if k % 2 else html.escape(p, quote=False).replace("*", "\\*") for k, p in enumerate(pieces))
+
+
+def prose(docstring: str) -> str:
+    """A docstring as Markdown: paragraphs, lists, ``**bold**`` words, and terms with their indented descriptions."""
+    out = []
+    for block in re.split(r"\n\s*\n", inspect.cleandoc(docstring)):
+        listed = re.sub(r"(?m)^(``.*)$\n((?:^    .*$\n?)+)", _definition, block + "\n")
+        out.append(plain(listed).replace("\\*\\*", "**"))
+    return re.sub(r"(?m)^\\\* ", "* ", "\n\n".join(out)) + "\n"
+
+
+def _definition(found: re.Match[str]) -> str:
+    return f"* {found[1]}: {' '.join(found[2].split())}\n"
+
+
+def sentence(text: str) -> str:
+    """A text that begins with a capital letter and ends with a full stop."""
+    text = text.strip()
+    first = re.match(r"[a-z]+(?=[ ,:;]|$)", text)  # a name such as recovery_behaviours_config stays as it is
+    text = text[0].upper() + text[1:] if first else text
+    return text + ("" if not text or text.endswith((".", "!", "?", ":")) else ".")
+
+
+# --- parameters ------------------------------------------------------------------------------------------------------
+def parameters(cls: type[Any], *, head: str = "parameter") -> str:
+    """The parameters that a dataclass declares: type, default, bounds, unit, meaning."""
+    hints = get_type_hints(cls)
+    rows = []
+    for field in dataclasses.fields(cls):
+        said = field.metadata
+        rows.append(
+            (
+                code(field.name),
+                kind_of(hints[field.name]),
+                "" if field.default is None else code(_text(field.default)),
+                bounds(said.get("minimum"), said.get("maximum")),
+                said.get("unit", ""),
+                sentence(plain(said.get("doc", ""))),
+            )
+        )
+    return table((head, "type", "default", "bounds", "unit", "meaning"), rows)
+
+
+def kind_of(hint: Any) -> str:
+    """A type as users know it."""
+    origin, args = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return kind_of(next(a for a in args if a is not type(None)))
+    if origin is Literal:
+        return codes(args)
+    if origin is tuple:
+        return f"{kind_of(args[0])}s, comma-separated" if args[1:2] == (...,) else f"{len(args)} {kind_of(args[0])}s"
+    names = {bool: "truth value", int: "integer", float: "number", str: "text", Path: "path", SecretStr: "secret text"}
+    return names[hint]
+
+
+def bounds(low: float | None, high: float | None, *, above: float | None = None) -> str:
+    """Bounds as a range."""
+    if above is not None:
+        return f"above {above:g}" + ("" if high is None else f", to {high:g}")
+    if low is not None and high is not None:
+        return f"{low:g} to {high:g}"
+    return f"from {low:g}" if low is not None else f"up to {high:g}" if high is not None else ""
+
+
+def _text(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return ",".join(map(_text, value))
+    return f"{value:g}" if isinstance(value, float) else str(value) if value != "" else '""'
+
+
+# --- formats ---------------------------------------------------------------------------------------------------------
+ANCHORS = {"local": "metres of the local frame", "wgs84": "degrees (WGS 84)"}
+BENDS = {
+    "nodes": "Edges are straight: a bend of more than 5 cm becomes a node, and a bend again when the file is uploaded.",
+    "foreign": "The consumer ignores the shape of edges: bends of edges from other formats become nodes.",
+}
+
+
+def formats_table() -> str:
+    """All formats: what they hold, and whether they are read and written."""
+    return table(
+        ("id", "what it is", "read", "write", "layers"),
+        (
+            (
+                f"[`{f.name}`](formats/{f.name}.md)",
+                plain(f.title),
+                "yes" if f.read else "no",
+                "yes" if f.write else "no",
+                ", ".join(sorted(f.carries)),
+            )
+            for f in all_formats().values()
+        ),
+    )
+
+
+def format_page(known: Format) -> str:
+    """The page of one format."""
+    module = sys.modules[(known.read or known.write or known.detect).__module__]
+    module = sys.modules.get(f"app.formats.{known.name}", module)
+    said = re.sub(rf"\A{known.name}(\.yaml)?: (?=(.))", "", inspect.getdoc(module) or known.title)
+    text, further = _helpers(said[0].upper() + said[1:])
+    out = [f"# {known.name}: {plain(known.title)}\n", prose(text), _facts(known)]
+    if known.read and dataclasses.fields(known.read_options):
+        out += ["## Parameters of an upload\n", parameters(known.read_options)]
+    if known.write and dataclasses.fields(known.write_options):
+        out += [
+            "## Parameters of a map\n",
+            f"In the address of a map, `/maps/{{environment}}/{known.name}?NAME=VALUE`, or as `-O NAME=VALUE` of "
+            "`fleetmap export`. Parameters of a [derivation](../derivations.md) go the same way.\n",
+            parameters(known.write_options),
+        ]
+    for name, doc in further:
+        out += [f"## {name.lstrip('_')}\n", prose(doc)]
+    if known.write:
+        out += _losses(known)
+    if known.check:
+        out += _rules(known)
+    return "\n".join(out)
+
+
+def _helpers(doc: str) -> tuple[str, list[tuple[str, str]]]:
+    """The docstring with links in place of the names of shared modules, and the docstrings of these."""
+    further: dict[str, str] = {}
+
+    def link(found: re.Match[str]) -> str:
+        try:
+            module = importlib.import_module(f"app.formats.{found[1]}")
+        except ModuleNotFoundError:
+            return found[0]
+        further[found[1]] = inspect.getdoc(module) or ""
+        return f"[{found[1].lstrip('_')}](#{found[1].strip('_')})"
+
+    pattern = re.compile(r"``(?:app\.formats\.)?(_[a-z0-9_]+)``")
+    text = pattern.sub(link, doc)
+    return text, [(name, pattern.sub(r"[\1](#\1)", said).replace("(#_", "(#")) for name, said in further.items()]
+
+
+def _facts(known: Format) -> str:
+    needs = known.needs
+    wants = " or ".join(" and ".join(sorted(layers)) for layers in needs.one_of if layers)
+    rows = [
+        ("Files", codes(known.files)),
+        ("Media types", codes(dict.fromkeys(known.media_types))),
+        ("Uploads end in", codes(known.extensions)),
+        ("Layers", ", ".join(sorted(known.carries)) + (" (of a grid only its place)" if known.outlines else "")),
+        ("A map needs", wants + (", and a datum" if needs.datum else "")),
+        ("A map also uses", ", ".join(sorted(needs.also))),
+        ("Coordinates", ANCHORS.get(needs.anchor or "", "")),
+        ("Bends of edges", BENDS.get(known.bends, "")),
+        ("Blocked edges", "stay in a map, with a mark" if known.marks_blocked else ""),
+        (
+            "Parts",
+            f"one at a time, by `{known.parts.level}` and `{known.parts.name}`; `*` gives all" if known.parts else "",
+        ),
+        ("Direction", "read only" if known.write is None else "written only" if known.read is None else ""),
+    ]
+    return "## Facts\n\n" + table(("fact", "value"), [row for row in rows if row[1]])
+
+
+def _losses(known: Format) -> list[str]:
+    assert known.write is not None
+    drops, fills = declared.drops(known.write), declared.fills(known.write)
+    out = []
+    if drops:
+        out += [
+            "## What a map drops\n",
+            "The report of each map lists what was dropped of this map, with counts, under `dropped`.\n",
+            table(("what", "why"), ((plain(what), plain(why)) for what, why in drops)),
+        ]
+    if fills:
+        out += [
+            "## What a map fills in\n",
+            "The report lists it under `template`. A parameter, or an environment's template, sets another value.\n",
+            table(("what", "why", "parameter"), ((plain(w), plain(y), code(o) if o else "") for w, y, o in fills)),
+        ]
+    return out
+
+
+def _rules(known: Format) -> list[str]:
+    assert known.check is not None
+    module = sys.modules[known.check.__module__]
+    levels = {"error": "refused", "warning": "doubtful"}
+    rows = [(levels[n], code(at) if at else "", plain(text)) for n, at, text in declared.findings(known.check)]
+    return [
+        "## Rules of its consumers\n",
+        prose(inspect.getdoc(module) or ""),
+        "`fleetmap check` and the report of each map list what breaks a rule. *Refused*: a consumer does not load the "
+        "map, or misreads it (`level: error`). *Doubtful*: it loads the map, and may not do what is meant "
+        "(`level: warning`).\n",
+        table(("level", "where", "finding"), rows),
+    ]
+
+
+# --- derivations and generators --------------------------------------------------------------------------------------
+def derivations() -> str:
+    """All derivations, with their parameters."""
+    out = []
+    for one in derive.all_derivations().values():
+        out += [f"## {one.name}\n", _about(one), _layers(one), parameters(one.parameters)]
+    return "\n".join(out)
+
+
+def _layers(one: Derivation) -> str:
+    rows = [
+        ("needs", ", ".join(sorted(one.needs))),
+        ("also uses", ", ".join(sorted(one.also))),
+        ("gives", one.gives + (f" ({', '.join(sorted(one.makes))})" if one.makes else "")),
+        ("cost", f"{one.cost:g}"),
+        ("further derivations", "none may follow: its result is good for a map only" if one.last else ""),
+    ]
+    return table(("", ""), [row for row in rows if row[1]])
+
+
+def generators() -> str:
+    """All generators, with their parameters."""
+    out = []
+    for one in generate.all_generators().values():
+        rows = [
+            ("needs", ", ".join(sorted(one.needs))),
+            ("changes", ", ".join(sorted(one.changes))),
+            ("also uses", ", ".join(sorted(one.also))),
+            ("gives", ", ".join(sorted(one.gives))),
+        ]
+        facts = table(("", ""), [row for row in rows if row[1]])
+        out += [f"## {one.name}\n", _about(one), facts, parameters(one.parameters)]
+    return "\n".join(out)
+
+
+def _about(one: Derivation | Generator) -> str:
+    """What its function and its module say."""
+    module = prose(inspect.getdoc(sys.modules[one.function.__module__]) or "")
+    return f"{prose(inspect.getdoc(one.function) or one.title)}\n{module}"
+
+
+# --- settings, metrics, errors ---------------------------------------------------------------------------------------
+def settings() -> str:
+    """All settings."""
+    hints = get_type_hints(Settings)
+    rows = []
+    for name, field in Settings.model_fields.items():
+        low, above, high = (next((getattr(m, w) for m in field.metadata if hasattr(m, w)), None) for w in LIMITS)
+        default = field.default if field.default_factory is None else None
+        is_size = name.endswith("_bytes") or name.endswith("_bytes_per_second")
+        size = is_size and isinstance(default, int) and default > 0
+        shown = format_size(int(default)) if size else _text(default)
+        rows.append(
+            (
+                f"`FLEETMAP_{name.upper()}`",
+                "size" if is_size else kind_of(hints[name]),
+                code(shown) if default is not None and shown != '""' else "",
+                bounds(low, high, above=above),
+                field.description or "",
+            )
+        )
+    return table(("setting", "type", "default", "bounds", "meaning"), rows)
+
+
+def metrics() -> str:
+    """All metrics of ``/metrics``."""
+    own = Metrics()
+    rows = [
+        (code(name), one._type, codes(one._labelnames), one._documentation)
+        for one in vars(own).values()
+        if isinstance(one, MetricWrapperBase) and not one._labelvalues
+        for name in [one._name + ("_total" if one._type == "counter" else "")]
+    ]
+    hits = own.registry._names_to_collectors["fleetmap_cache_hits"]
+    rows.append((code("fleetmap_cache_hits_total"), hits._type, codes(hits._labelnames), hits._documentation))
+    with tempfile.TemporaryDirectory() as folder:
+        empty: Any = SimpleNamespace(environments=lambda **_: ([], None), blob_dir=Path(folder))
+        for collector in (_Heads(empty), _Scrubs(empty)):
+            for family in collector.collect():
+                labels = getattr(family, "_labelnames", ())
+                rows.append((code(family.name), family.type, codes(labels), family.documentation))
+    return table(("metric", "type", "labels", "meaning"), sorted(rows))
+
+
+def errors() -> str:
+    """All types of problems."""
+    rows = []
+    for cls, (status, title) in problems.STATUS.items():
+        _, _, kind = problems.status_of(cls.__new__(cls))
+        rows.append((code(kind), str(status), title, sentence(plain(inspect.getdoc(cls) or ""))))
+    return table(("type", "status", "title", "meaning"), sorted(rows, key=lambda row: (row[1], row[0])))
+
+
+def unlisted_errors() -> list[type[FleetMapError]]:
+    """Classes of errors that answer as their nearest listed base."""
+    todo, out = [FleetMapError], []
+    while todo:
+        cls = todo.pop()
+        todo += cls.__subclasses__()
+        if cls not in problems.STATUS and cls is not FleetMapError and cls.__module__.startswith("app."):
+            out.append(cls)
+    return out
+
+
+# --- HTTP ------------------------------------------------------------------------------------------------------------
+@cache
+def application() -> Any:
+    """The server's application, never started."""
+    with tempfile.TemporaryDirectory() as folder:
+        return create_app(Settings(_env_file=None, data_dir=Path(folder), zenoh_mode="off"))  # type: ignore[call-arg]
+
+
+@cache
+def openapi() -> dict[str, Any]:
+    """The OpenAPI document."""
+    schema: dict[str, Any] = application().openapi()
+    return schema
+
+
+def http() -> str:
+    """All calls by tag, then all schemas."""
+    schema = openapi()
+    roles = _roles()
+    out = []
+    for tag in schema["tags"]:
+        if tag["name"] == "maps by format":
+            continue
+        out.append(f"## {tag['name'].capitalize()}\n\n{tag['description']}\n")
+        out += [
+            _operation(method, path, item[method], roles.get((method, path), ""))
+            for path, item in schema["paths"].items()
+            for method in METHODS
+            if tag["name"] in item.get(method, {}).get("tags", ())
+        ]
+    out.append("## Schemas\n")
+    for name, shape in sorted(schema["components"]["schemas"].items()):
+        out.append(f"### {name}\n\n{plain(shape.get('description', ''))}\n\n{_members(shape)}")
+    return "\n".join(out)
+
+
+def _roles() -> dict[tuple[str, str], str]:
+    """(method, path) -> the least role that a token needs."""
+    out = {}
+    routers = [route.original_router for route in application().routes if hasattr(route, "original_router")]
+    while routers:
+        for route in routers.pop().routes:
+            if hasattr(route, "original_router"):
+                routers.append(route.original_router)
+                continue
+            for dependency in route.dependant.dependencies:
+                if isinstance(dependency.call, AtLeast):
+                    least = code(dependency.call.need)
+                    role = f"{least}, in all environments" if dependency.call.everywhere else least
+                    for method, prefix in itertools.product(route.methods, ("", API)):
+                        out[method.lower(), prefix + route.path] = role
+    return out
+
+
+def _operation(method: str, path: str, said: Mapping[str, Any], role: str) -> str:
+    described = plain(said.get("description", ""))
+    out = [f"### {method.upper()} {plain(path)}\n", f"**{sentence(plain(said['summary']))}** {described}\n"]
+    if {"link": []} in said.get("security", ()):
+        role = "`viewer`, or a [signed link](#post-apiv1environmentsenvversionsvlinks)"
+    out.append(f"Role: {role}.\n" if role else "No token is needed.\n")
+    shown = said.get("parameters", [])
+    if "maps" in said["tags"] and "{format}" in path:
+        shown = [p for p in shown if p["in"] != "query" or p["name"] in ("derive", "closures")]
+        out.append("It also takes the parameters of the [format](formats.md) and of [derivations](derivations.md).\n")
+    out.append(
+        table(
+            ("parameter", "in", "type", "default", "meaning"),
+            (
+                (
+                    code(p["name"]) + (" (required)" if p.get("required") and p["in"] != "path" else ""),
+                    p["in"],
+                    _schema(p.get("schema", {})),
+                    code(_text(p["schema"]["default"])) if p.get("schema", {}).get("default") is not None else "",
+                    sentence(plain(p.get("description", p.get("schema", {}).get("description", "")))),
+                )
+                for p in shown
+            ),
+        )
+    )
+    for media, body in said.get("requestBody", {}).get("content", {}).items():
+        shape = body.get("schema", {})
+        out.append(f"Body, `{media}`: {_schema(shape)}\n" if shape else f"Body: `{media}`\n")
+    rows = []
+    for status, answer in sorted(said["responses"].items()):
+        if status in EVERYWHERE:
+            continue
+        content = answer.get("content", {})
+        shapes = dict.fromkeys(_schema(c["schema"]) for c in content.values() if c.get("schema"))
+        rows.append((status, sentence(plain(answer.get("description", ""))), codes(content), ", ".join(shapes)))
+    out.append(table(("status", "answer", "media type", "schema"), rows))
+    shared = sorted(EVERYWHERE & set(said["responses"]))
+    if shared:
+        out.append(f"Also {', '.join(shared)}: see [errors](errors.md).\n")
+    return "\n".join(out)
+
+
+def _schema(shape: Mapping[str, Any]) -> str:
+    """A JSON schema in a few words, with links to the named ones."""
+    if "$ref" in shape:
+        name = shape["$ref"].rpartition("/")[2]
+        return f"[{name}](#{name.lower()})"
+    if "enum" in shape:
+        return codes(shape["enum"])
+    if "const" in shape:
+        return code(shape["const"])
+    for word in ("anyOf", "oneOf", "allOf"):
+        if word in shape:
+            return " or ".join(dict.fromkeys(_schema(s) for s in shape[word] if s.get("type") != "null"))
+    kind = shape.get("type", "any")
+    if kind == "array":
+        return f"list of {_schema(shape.get('items', {}))}"
+    if kind == "object" and isinstance(shape.get("additionalProperties"), dict) and shape["additionalProperties"]:
+        return f"map of {_schema(shape['additionalProperties'])}"
+    if kind == "object" and shape.get("properties"):
+        return "object with " + codes(shape["properties"])
+    limits = bounds(shape.get("minimum"), shape.get("maximum"), above=shape.get("exclusiveMinimum"))
+    if shape.get("maxLength"):
+        limits = f"up to {shape['maxLength']} characters"
+    return f"{kind}{f' ({limits})' if limits else ''}"
+
+
+def _members(shape: Mapping[str, Any]) -> str:
+    required = set(shape.get("required", ()))
+    rows = []
+    for name, member in shape.get("properties", {}).items():
+        default = member.get("default")
+        rows.append(
+            (
+                code(name),
+                _schema(member),
+                "yes" if name in required else "",
+                code(_text(default)) if isinstance(default, (str, int, float, bool)) else "",
+                sentence(plain(member.get("description", ""))),
+            )
+        )
+    return table(("member", "type", "required", "default", "meaning"), rows) or f"{_schema(shape)}\n"
+
+
+# --- command line ----------------------------------------------------------------------------------------------------
+def cli() -> str:
+    """All commands, by the help's panels."""
+    root: Any = get_command(commands.build())
+    out = []
+    for panel, listed in commands.PANELS.items():
+        out.append(f"## {panel}\n")
+        for name, _ in listed:
+            out += _command(f"fleetmap {name}", root.commands[name])
+    return "\n".join(out)
+
+
+def _command(name: str, command: Any) -> list[str]:
+    is_serve = name == "fleetmap serve"
+    if is_serve:
+        command = get_command(commands.build("serve")).commands["serve"]  # type: ignore[attr-defined]
+    out = [f"### {name}\n", f"{plain(inspect.cleandoc(command.help or ''))}\n"]
+    rows = []
+    for p in command.params:
+        if getattr(p, "hidden", False) or (is_serve and p.name in Settings.model_fields):
+            continue
+        if p.param_type_name == "argument":
+            label = code(p.metavar or p.human_readable_name.upper())
+        else:
+            label = ", ".join(code(o) for o in (*p.opts, *p.secondary_opts))
+            label += "" if getattr(p, "is_flag", False) else f" `{p.metavar or 'VALUE'}`"
+        default = p.default if isinstance(p.default, (str, int, float)) and not isinstance(p.default, bool) else ""
+        variables = p.envvar if isinstance(p.envvar, str) else ", ".join(p.envvar or ())
+        rows.append(
+            (
+                label + (" (required)" if p.required and p.param_type_name == "option" else ""),
+                code(default) if default not in ("", None) else "",
+                code(variables) if variables else "",
+                plain(getattr(p, "help", None) or ""),
+            )
+        )
+    out.append(table(("argument or option", "default", "variable", "meaning"), rows))
+    if is_serve:
+        out.append("Each [setting](settings.md) is an option as well: `FLEETMAP_LOG_LEVEL` is `--log-level`.\n")
+    for child in sorted(getattr(command, "commands", {})):
+        out += _command(f"{name} {child}", command.commands[child])
+    return out
+
+
+# --- the store -------------------------------------------------------------------------------------------------------
+def encoding() -> str:
+    """The canonical encoding, as its module specifies it."""
+    text = inspect.getdoc(encode) or ""
+    return prose(text.partition("\n")[2])
+
+
+def chunk_tree() -> str:
+    """How a sequence is cut into nodes, as its module specifies it, with its numbers."""
+    text = inspect.getdoc(tree) or ""
+    numbers = [
+        ("children of an inner node, on average", str(2**tree.FANOUT_BITS)),
+        ("a node is cut again beyond this many times the average", str(tree.OVERSIZE)),
+        ("level at which everything goes into one node", str(tree.TOP)),
+        ("version of the encoding", str(encode.ENCODING)),
+    ]
+    return f"{prose(text.partition(chr(10))[2])}\n{table(('number', 'value'), numbers)}"
+
+
+BLOCKS: Mapping[str, Callable[[], str]] = {
+    "formats": formats_table,
+    "derivations": derivations,
+    "generators": generators,
+    "settings": settings,
+    "metrics": metrics,
+    "errors": errors,
+    "http": http,
+    "cli": cli,
+    "encoding": encoding,
+    "chunk-tree": chunk_tree,
+}
+"""Name in a marker -> what makes the Markdown."""

@@ -1,0 +1,63 @@
+"""The payloads in ``docs/reference/events.md`` are those that the server sends: the same members, of the same types."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+from app.event_types import EVENT_TYPES
+from tests.api.conftest import Api
+
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "events.md"
+
+
+def documented() -> dict[str, dict[str, Any]]:
+    """The JSON blocks of the page, by event type."""
+    found = [json.loads(block) for block in re.findall(r"^```json\n(.*?)^```", PAGE.read_text(), re.S | re.M)]
+    events = {event["type"]: event for event in found if "type" in event}
+    assert len(events) == sum("type" in event for event in found)
+    return events
+
+
+def shape(value: Any) -> Any:
+    """The members of a JSON value and their types; of a list, the shape of its first item."""
+    if isinstance(value, dict):
+        return {name: shape(member) for name, member in value.items()}
+    if isinstance(value, list):
+        return [shape(member) for member in value[:1]]
+    return type(value).__name__
+
+
+def happened(api: Api, env: str) -> dict[str, dict[str, Any]]:
+    """One event of each type, by what causes it."""
+    channel, overlays = f"environments/{env}/channels/production", f"environments/{env}/overlays"
+    api("PUT", channel, 200, json={"version": 2})
+    api("PUT", channel, 200, json={"version": 3, "rollout": {"ready": 0.9, "failed": 0.2}})
+    api("DELETE", f"{channel}/planned")
+    report = {"kind": "blocked", "edge": "gate_barn", "detail": "a fallen tree"}
+    for step in ("accept", "reject"):
+        one = api.post(overlays, report).json()["id"]
+        api.post(f"{overlays}/{one}/{step}", expect=200)
+        if step == "accept":
+            api.post(f"{overlays}/{one}/end", expect=200)
+    api.post(overlays, {**report, "ttl_seconds": 1})
+    deadline = time.monotonic() + 60
+    while not api.get(f"{overlays}?state=expired").json():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    api("DELETE", f"environments/{env}")
+    lines = api.get(f"events?environment={env}&since=0&follow=false").text.splitlines()
+    events = [json.loads(line[5:]) for line in lines if line.startswith("data:")]
+    return {event["type"]: event for event in events}
+
+
+def test_documented_payloads_match_sent_events(api: Api, farm: str) -> None:
+    sent = happened(api, farm)
+    assert sorted(sent) == sorted(EVENT_TYPES)
+    page = documented()
+    assert sorted(page) == sorted(sent), json.dumps(sent)
+    for kind, event in sent.items():
+        assert shape(page[kind]) == shape(event), f"{kind}: the server sends {json.dumps(event)}"
